@@ -3,7 +3,7 @@
 import re
 import sys
 
-from fieldfuse.pipelines.thread_limits import bound_threads
+from fieldfuse.pipelines.options import bound_threads
 
 ONE_THREAD = ("benchmarks.few_views", "benchmarks.ablations")  # they count the processor time of one thread
 

@@ -23,11 +23,11 @@ from fieldfuse.pipelines.options import Config, Device, ImageSize, Out, Pairs, Q
 from fieldfuse.progress import SILENT, Progress
 from fieldfuse.render.field import Field
 from fieldfuse.render.image import make_renderer, render_view
-from fieldfuse.steps import check_engine
+from fieldfuse.steps import choose_device
 from fieldfuse.training.engine import chosen_engine, fit_device, make_engine
 from fieldfuse.training.guided import fit_guided
-from fieldfuse.training.rays import PixelPool
-from fieldfuse.training.step import Rates
+from fieldfuse.training.losses import Rates
+from fieldfuse.training.pixels import PixelPool
 
 IMAGE = (640, 480)
 RENDERS, STEPS, ENOUGH = 9, 50, 3.0  # repetitions at most, and seconds after which fewer will do
@@ -54,7 +54,7 @@ def engines(
     with opened(source, out, options, quiet) as ready:
         settings, progress = ready.job.settings, ready.job.progress
         for name in names:
-            check_engine(name, settings.device)
+            choose_device(settings.device, name)
         ground = ready.ground()
         plan = [{"engine": name, "budget": budget} for name in names for budget in seconds]
         run = lambda entry: engine_row(ground, entry["engine"], entry["budget"], progress)  # noqa: E731

@@ -22,6 +22,7 @@ from fieldfuse.evaluation.score import nearest_image_scores
 from fieldfuse.nerfusion.model import NerfusionModel
 from fieldfuse.pipelines.options import Config, ImageSize, Out, Pairs, Quiet, Seed, Source, gather
 from fieldfuse.render.field import Field
+from fieldfuse.training.fit import Begin
 from fieldfuse.training.from_network import NetworkOptions, load_networks
 from fieldfuse.training.guided import fit_guided
 from fieldfuse.training.network_start import network_start
@@ -111,7 +112,7 @@ class Bench:
         settings = replace(settings, fit=replace(settings.fit, budget=entry["budget"]))
         made = self.inferred(entry["views"])[1] if entry["start"] == NETWORK else None
         first = None if made is None else network_start(made, ground.views, ground.scene, settings)
-        fit = fit_guided(ground.views, ground.scene, settings, progress, start=first, coarse=first is not None, ticks=time.process_time)
+        fit = fit_guided(ground.views, ground.scene, settings, progress, Begin(start=first, coarse=first is not None), time.process_time)
         return {**measured(fit.field, ground), "steps": fit.steps, "resolution": fit.field.resolution}
 
 

@@ -22,8 +22,8 @@ from fieldfuse.nerfusion.model import NerfusionModel
 from fieldfuse.pipelines.console import make_progress
 from fieldfuse.pipelines.direct_field import training_key_frames, weights_state
 from fieldfuse.pipelines.job import Job, open_job
-from fieldfuse.pipelines.steps_capture import choose_frames, find_camera_poses, find_capture
-from fieldfuse.pipelines.steps_effects import find_effects
+from fieldfuse.pipelines.options import Place
+from fieldfuse.pipelines.prepare import choose_frames, find_camera_poses, find_capture, find_effects
 from fieldfuse.poses.scene import Scene, describe_scene
 from fieldfuse.progress import SILENT, Progress
 from fieldfuse.render.field import Field
@@ -77,7 +77,7 @@ class Opened:
 @contextmanager
 def opened(source: Path, out: Path, options: dict[str, Any], quiet: bool) -> Iterator[Opened]:
     """`source` in a run folder `out`, with everything up to the effects done as a run does it."""
-    with open_job(source, out, options, make_progress(quiet)) as job:
+    with open_job(Place(source, out), options, make_progress(quiet)) as job:
         capture = choose_frames(job, find_capture(job))
         posed = find_camera_poses(job, capture).apply(capture)
         corrections = find_effects(job, posed)

@@ -13,10 +13,10 @@ from benchmarks.timing import Case, compare, pinned
 from fieldfuse.evaluation.sphere import around, lens, sphere_field, sphere_pixels
 from fieldfuse.render.numba_renderer import NumbaRenderer
 from fieldfuse.render.rays import render_rays
-from fieldfuse.training.engine import TorchEngine
-from fieldfuse.training.numba_engine import NumbaOptimiser
-from fieldfuse.training.rays import PixelPool
-from fieldfuse.training.step import Rates
+from fieldfuse.training.losses import Rates
+from fieldfuse.training.numba_engine import NumbaEngine
+from fieldfuse.training.pixels import PixelPool
+from fieldfuse.training.torch_engine import TorchEngine
 
 SIZES = (64, 128, 256)
 BATCH = 2048
@@ -33,7 +33,7 @@ def step_cases(sizes: tuple[int, ...] = SIZES, repetitions: int = 5) -> Iterator
     pool = sphere_pixels()
     with pinned(1):
         for size in sizes:
-            engine, reference = NumbaOptimiser(sphere_field(size), pool, threads=1), TorchEngine(sphere_field(size), pool, 0)
+            engine, reference = NumbaEngine(sphere_field(size), pool, threads=1), TorchEngine(sphere_field(size), pool, 0)
             times = compare(
                 lambda e=engine: e.step(BATCH, RATES),  # type: ignore[misc]
                 lambda r=reference: r.step(BATCH, RATES),  # type: ignore[misc]
@@ -42,15 +42,15 @@ def step_cases(sizes: tuple[int, ...] = SIZES, repetitions: int = 5) -> Iterator
             yield Case("training step", f"{size}³", "ray", BATCH, *times, against="torch engine", counts=step_counts(engine))
 
 
-def step_counts(engine: NumbaOptimiser) -> dict[str, float]:
+def step_counts(engine: NumbaEngine) -> dict[str, float]:
     """Operations of one step a ray: samples looked up, and lattice corners that get a gradient."""
-    before = engine.next_record
+    before = sum(engine.given)
     _, looked = engine.step(BATCH, RATES)
     field = engine.field
     return {
         "looked_up_a_ray": round(looked / BATCH, 3),
         "voxels": field.voxels,
-        "touched_corners": max(before, engine.next_record),
+        "touched_corners": max(before, sum(engine.given)),
         "bytes_a_voxel": round(field.bytes / field.voxels, 1),
     }
 
@@ -76,7 +76,7 @@ def thread_cases(threads: int, size: int = 128, repetitions: int = 5) -> Iterato
     from fieldfuse.camera import pixel_grid, rays
 
     given = rays(lens(256, 256), around()[1], pixel_grid(256, 256))[:2]
-    many, one = (NumbaOptimiser(sphere_field(size), pool, threads=n) for n in (threads, 1))
+    many, one = (NumbaEngine(sphere_field(size), pool, threads=n) for n in (threads, 1))
     renderers = [NumbaRenderer(field, n) for n in (threads, 1)]
     pairs: list[tuple[str, int, Callable[[], Any], Callable[[], Any]]] = [
         ("training step", 4 * BATCH, lambda: many.step(4 * BATCH, RATES), lambda: one.step(4 * BATCH, RATES)),
@@ -184,9 +184,9 @@ def growth_cases(repetitions: int = 5) -> Iterator[Case]:
 def _growing(name: str, what: str, settings: list[tuple[int, PixelPool, int]], repetitions: int) -> Iterator[Case]:
     """Each setting (size, pixels, rays a step) against the first."""
     field = sphere_field(LATTICE)
-    first, rays_of_first = NumbaOptimiser(field, settings[0][1], threads=1), settings[0][2]
+    first, rays_of_first = NumbaEngine(field, settings[0][1], threads=1), settings[0][2]
     for size, pool, rays in settings:
-        engine = NumbaOptimiser(sphere_field(LATTICE), pool, threads=1)
+        engine = NumbaEngine(sphere_field(LATTICE), pool, threads=1)
         ours, reference = compare(
             lambda e=engine, n=rays: [e.step(n, RATES) for _ in range(4)],  # type: ignore[misc]
             lambda: [first.step(rays_of_first, RATES) for _ in range(4)],

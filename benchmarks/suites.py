@@ -15,17 +15,19 @@ from benchmarks.experiment import MEASURES, Experiment, Row, application, markdo
 from benchmarks.protocols import PAPER, SUITES, Suite, Variant, suite_of
 from fieldfuse.capture.types import Views
 from fieldfuse.config import settings_dict
+from fieldfuse.effects.correct import Corrections
 from fieldfuse.errors import FieldfuseError, Interrupted, OutputError
 from fieldfuse.evaluation import words
 from fieldfuse.evaluation.report import plain
 from fieldfuse.evaluation.score import compare_views
 from fieldfuse.pipelines.console import ConsoleProgress, make_progress
 from fieldfuse.pipelines.direct_field import direct_field, weights_state
+from fieldfuse.pipelines.fields import finished_field, render_test_views
 from fieldfuse.pipelines.job import Job, open_job, read_settings
-from fieldfuse.pipelines.options import Device, ImageSize, Out, Pairs, Preset, Quiet, Seed, Threads, gather
+from fieldfuse.pipelines.options import Device, ImageSize, Out, Pairs, Place, Preset, Quiet, Seed, Threads, gather
+from fieldfuse.pipelines.prepare import Prepared, choose_keyframes, find_camera_poses, find_capture, make_views, measure_scene
 from fieldfuse.pipelines.rendered import Pictures, load_pictures, save_pictures, to_picture
-from fieldfuse.pipelines.steps_capture import find_camera_poses, find_capture, make_views, measure_scene
-from fieldfuse.pipelines.steps_results import fit_radiance_field, render_test_views
+from fieldfuse.pipelines.stages import Stage
 from fieldfuse.poses.scene import Scene
 from fieldfuse.render.image import render_view
 
@@ -83,14 +85,16 @@ def _names(text: str | None) -> list[str] | None:
 def run_variant(variant: Variant, source: Path, place: Path, options: dict[str, Any], progress: ConsoleProgress) -> Row:
     """One scene in one variant: a run's own stages on the frames that the protocol picks."""
     start = time.monotonic()
-    with open_job(source, place, options, progress) as job:
+    with open_job(Place(source, place), options, progress) as job:
         capture = variant.pick(find_capture(job))
-        posed = find_camera_poses(job, capture).apply(capture)
+        poses = find_camera_poses(job, capture)
+        posed = poses.apply(capture)
         scene = measure_scene(job, posed)
         views = make_views(job, posed, scene)
         if variant.fitted:
-            field, _ = fit_radiance_field(job, views, scene)
-            voxels, renders = field.voxels, render_test_views(job, field, views, scene)
+            ready = Prepared(capture, poses, posed, Corrections(), scene, views, choose_keyframes(job, scene, views))
+            field = finished_field(job, ready).field
+            voxels, renders = field.voxels, render_test_views(job, ready, field)
         else:
             renders = render_directly(job, views, scene)
             voxels = renders.facts["voxels"]
@@ -106,7 +110,7 @@ def run_variant(variant: Variant, source: Path, place: Path, options: dict[str, 
                 "height": views.intrinsics[0].height,
                 "fit_seconds": made.seconds,
                 "peak_memory_mb": made.peak_memory_mb,
-                "seconds": round(time.monotonic() - start + job.stages.fresh_seconds(), 3),
+                "seconds": round(time.monotonic() - start + job.stages.reused_seconds(), 3),
                 "voxels": voxels,
                 "stages": job.stages.summary(),
                 "error": None,
@@ -136,7 +140,7 @@ def render_directly(job: Job, views: Views, scene: Scene) -> Pictures:
         return [path]
 
     uses = [asdict(settings.network), asdict(settings.keyframes), weights_state(settings), settings.field.background, settings.device]
-    return job.stages.run("direct", make, save, lambda: load_pictures(path), uses=uses, after=["scene", "views"])
+    return job.run(Stage("direct", make, save, lambda: load_pictures(path), ["scene", "views"], uses))
 
 
 def table(data: Row) -> str:

@@ -14,7 +14,7 @@ from benchmarks.experiment import Row, application, checked, portable, program, 
 from benchmarks.run_tables import budget_table, compare_table, is_report, mean_load, run_table, tradeoff_table
 from fieldfuse.errors import InputError
 from fieldfuse.evaluation.tradeoff import tradeoff_data
-from fieldfuse.pipelines.kept import ANY, TRADEOFF, fitting, read_kept
+from fieldfuse.pipelines import schemas
 
 
 def table(
@@ -39,7 +39,7 @@ def sections(files: list[Path], name: str | None, data: Path | None) -> list[tup
     Raises:
         InputError: a file holds no results, or there is one name for several tables.
     """
-    found = [(path, read_kept(path, ANY)) for path in files]
+    found = [(path, schemas.read_checked(path, Any)) for path in files]
     contents = [content for _, content in found]
     budgets = [content for content in contents if isinstance(content, dict) and isinstance(content.get("budget"), dict)]
     make = budget_table if budgets and len(budgets) == len(found) else run_table if all(map(is_report, contents)) else None
@@ -61,7 +61,7 @@ def _section(path: Path, content: Any, title: str, data: Path | None) -> str:
         return section(whole, _table_of(whole["experiment"]))
     if "methods" in whole:
         return section({**whole, "title": title}, compare_table)
-    fitting(content, TRADEOFF, path)
+    schemas.checked(content, schemas.Tradeoff, path)
     whole = tradeoff_data({**whole, "rows": list(content["rows"])})
     return section({**whole, "title": title, "machine": mean_load(whole)}, tradeoff_table)
 

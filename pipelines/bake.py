@@ -2,47 +2,41 @@
 
 from __future__ import annotations
 
-import time
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Annotated, Any
 
 import typer
 
-from fieldfuse.pipelines.options import Config, Json, OptionalOut, Pairs, Quiet, Target, Threads, gather
+from fieldfuse.pipelines.options import Options, Place, bound_threads, show, takes
 
 SEEN = 0.01  # as `fieldfuse.render.bake` has it
 
 
+@takes("threads config pairs quiet json")
 def bake(
-    target: Target,
-    out: OptionalOut = None,
+    place: Place,
     seen: Annotated[
         float, typer.Option(min=0, max=1, help="Voxels in which no training pixel has more of its light are left out; 0 keeps all.")
     ] = SEEN,
     to: Annotated[Path | None, typer.Option(help="The file. Default: DIR/exports/baked.safetensors.", show_default=False)] = None,
-    threads: Threads = None,
-    config: Config = None,
-    pairs: Pairs = None,
-    quiet: Quiet = False,
-    json: Json = False,
+    *,
+    options: Options,
 ) -> None:
     """Quantise the field of a run to bytes and say what that costs at the held-out views."""
-    from fieldfuse.pipelines.thread_limits import bound_threads
+    settings = options.settings()
+    bound_threads(settings)
+    data = bake_run(place, settings, seen, to, options.quiet)
 
-    options = gather(None, config, pairs, threads=threads)
-    bound_threads(options)
-    data = bake_run(target, out, options, seen, to, quiet)
-    if json:
-        import json as writer
-
-        typer.echo(writer.dumps(data, indent=1))
-    elif not quiet:
+    def lines() -> Iterator[str]:
         loss = "" if data["loss"] is None else f", {data['loss']:.2f} dB below the field ({data['psnr']:.2f}) at the held-out views"
         size, before = data["bytes"] / 1e6, data["field_bytes"] / 1e6
-        typer.echo(f"{data['voxels']:,} voxels in {size:.1f} MB (field: {before:.1f} MB){loss}: {data['to']}")
+        yield f"{data['voxels']:,} voxels in {size:.1f} MB (field: {before:.1f} MB){loss}: {data['to']}"
+
+    show(data, options, lines)
 
 
-def bake_run(target: Path, out: Path | None, options: dict[str, Any], seen: float, to: Path | None, quiet: bool) -> dict[str, Any]:
+def bake_run(place: Place, options: dict[str, Any], seen: float, to: Path | None, quiet: bool) -> dict[str, Any]:
     """Bake the field of a run, write it, read it back, and compare both at the held-out views.
 
     Returns:
@@ -58,37 +52,36 @@ def bake_run(target: Path, out: Path | None, options: dict[str, Any], seen: floa
     from fieldfuse.evaluation.metrics import psnr
     from fieldfuse.evaluation.score import as_photo, entry
     from fieldfuse.pipelines.console import make_progress
+    from fieldfuse.pipelines.fields import finished_field
     from fieldfuse.pipelines.job import open_job
     from fieldfuse.pipelines.pictures import baked, baked_place
-    from fieldfuse.pipelines.reconstruct import BEFORE, stand
+    from fieldfuse.pipelines.prepare import BEFORE, prepare
     from fieldfuse.pipelines.rendered import to_picture
-    from fieldfuse.pipelines.steps_results import fit_radiance_field
     from fieldfuse.render.bake_file import read_baked, write_baked
     from fieldfuse.render.image import make_renderer, render_view
 
-    with open_job(target, out, options, make_progress(quiet), (*BEFORE, "field")) as job:
-        _, _, _, scene, views = stand(job)
-        field, _ = fit_radiance_field(job, views, scene)
-        job.progress.begin("bake")
-        start, place = time.monotonic(), to or baked_place(job)
-        write_baked(place, baked(job, field, views, seen), scene.working_from_input)
-        small = read_baked(place)
-        shown = [(one, make_renderer(one)) for one in (field.to("cpu"), small.to_field())]
-        scores = []
-        for index in map(int, np.flatnonzero(views.test)):
-            job.progress.check()
-            lens, pose = views.intrinsics[index], views.world_from_camera[index]
-            truth, valid = views.photo(index), entry(views.valid, index)
-            # In 8 bits, as the report's are: without them a good field would have some hundredths of a decibel more here.
-            renders = [to_picture(render_view(one, lens, pose, view)) for one, view in shown]
-            pair = [psnr(as_photo(render, views, index), truth, valid) for render in renders]
-            if None not in pair:
-                scores.append(pair)
-        job.progress.finish("bake", time.monotonic() - start, False)
+    with open_job(place, options, make_progress(quiet), (*BEFORE, "field")) as job:
+        ready = prepare(job)
+        views, field = ready.views, finished_field(job, ready).field.to("cpu")
+        target = to or baked_place(job)
+        with job.progress.stage("bake"):
+            write_baked(target, baked(job, field, views, seen), ready.scene.working_from_input)
+            small = read_baked(target)
+            shown = [(one, make_renderer(one)) for one in (field, small.to_field())]
+            scores = []
+            for index in map(int, np.flatnonzero(views.test)):
+                job.progress.check()
+                lens, pose = views.intrinsics[index], views.world_from_camera[index]
+                truth, valid = views.photo(index), entry(views.valid, index)
+                # In 8 bits, as the report's are: without them a good field would have some hundredths of a decibel more here.
+                renders = [to_picture(render_view(one, lens, pose, view)) for one, view in shown]
+                pair = [psnr(as_photo(render, views, index), truth, valid) for render in renders]
+                if None not in pair:
+                    scores.append(pair)
     mean = np.mean(np.array(scores, np.float64), 0) if scores else None
     return {
-        "to": str(place),
-        "bytes": place.stat().st_size,
+        "to": str(target),
+        "bytes": target.stat().st_size,
         "field_bytes": field.bytes,
         "voxels": small.voxels,
         "field_voxels": field.voxels,

@@ -17,23 +17,21 @@ import typer
 
 from fieldfuse import __version__
 from fieldfuse.errors import FieldfuseError, Interrupted
-from fieldfuse.pipelines import (
-    bake,
-    compare,
-    evaluate,
-    export,
-    finetune,
-    info,
-    poses,
-    render,
-    run,
-    simulate,
-    tradeoff,
-    train,
-    tsdf,
-    view,
-)
-from fieldfuse.pipelines.options import Json
+from fieldfuse.pipelines.bake import bake
+from fieldfuse.pipelines.compare import compare
+from fieldfuse.pipelines.doctor import doctor
+from fieldfuse.pipelines.evaluate import evaluate
+from fieldfuse.pipelines.export import export
+from fieldfuse.pipelines.finetune import finetune
+from fieldfuse.pipelines.info import info
+from fieldfuse.pipelines.poses import poses
+from fieldfuse.pipelines.render import render
+from fieldfuse.pipelines.run import run
+from fieldfuse.pipelines.simulate import simulate
+from fieldfuse.pipelines.tradeoff import tradeoff
+from fieldfuse.pipelines.train import train
+from fieldfuse.pipelines.tsdf import tsdf
+from fieldfuse.pipelines.view import view
 
 STOPPED = 130
 
@@ -58,22 +56,9 @@ def _all(version: Annotated[bool, typer.Option("--version", callback=_version, i
     pass
 
 
-@app.command()
-def doctor(json: Json = False) -> None:
-    """Look at this machine: libraries, versions, devices, and what to do about what is missing."""
-    from dataclasses import asdict
-
-    from fieldfuse.pipelines import doctor as examination
-
-    checks = examination.collect()
-    if json:
-        import json as writer
-
-        typer.echo(writer.dumps([asdict(check) for check in checks], indent=1))
-    else:
-        examination.show(checks)
-    if any(check.status == examination.FAIL for check in checks):
-        raise typer.Exit(1)
+for _command in (doctor, run, poses, tsdf, finetune, render, view, export, bake, evaluate, compare, tradeoff, info, train, simulate):
+    # In the list of commands their first sentences are wrapped like this, and cut off otherwise.
+    app.command(short_help=" ".join((inspect.getdoc(_command) or "").partition("\n\n")[0].split()))(_command)
 
 
 def main(commands: typer.Typer = app) -> None:
@@ -120,27 +105,6 @@ def _fail(text: str, code: int, error: BaseException | None = None) -> None:
         traceback.print_exception(error)
     sys.stderr.write("fieldfuse: " + " ".join(text.split()) + "\n")
     sys.exit(code)
-
-
-for _command in (
-    run.run,
-    poses.poses,
-    tsdf.tsdf,
-    finetune.finetune,
-    render.render,
-    view.view,
-    export.export,
-    bake.bake,
-    evaluate.evaluate,
-    compare.compare,
-    tradeoff.tradeoff,
-    info.info,
-    train.train,
-    simulate.simulate,
-):
-    app.command()(_command)
-for _entry in app.registered_commands:  # in the list of commands their first sentences are wrapped like this, and cut off otherwise
-    _entry.short_help = " ".join((_entry.help or inspect.getdoc(_entry.callback) or "").partition("\n\n")[0].split())
 
 
 if __name__ == "__main__":

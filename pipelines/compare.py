@@ -2,29 +2,14 @@
 
 from __future__ import annotations
 
-import json as writer
 import sys
-from typing import Annotated
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Annotated, Any
 
 import typer
 
-from fieldfuse.pipelines.options import (
-    Budget,
-    Config,
-    Device,
-    Holdout,
-    ImageSize,
-    Json,
-    OptionalOut,
-    Pairs,
-    PosesFrom,
-    Preset,
-    Quiet,
-    Seed,
-    Target,
-    Threads,
-    gather,
-)
+from fieldfuse.pipelines.options import Options, Place, bound_threads, show, takes
 
 Depth = Annotated[
     str,
@@ -37,44 +22,29 @@ FORMATS = "export.formats=[ply]"  # the mesh alone: what is compared
 DEPTH_FROM = "fit.depth_from=any"  # where pictures are matched for a surface, the field may know that depth, too
 
 
-def compare(
-    target: Target,
-    out: OptionalOut = None,
-    depth: Depth = "auto",
-    preset: Preset = None,
-    budget: Budget = None,
-    image_size: ImageSize = None,
-    holdout: Holdout = None,
-    device: Device = None,
-    threads: Threads = None,
-    seed: Seed = None,
-    poses: PosesFrom = None,
-    config: Config = None,
-    pairs: Pairs = None,
-    quiet: Quiet = False,
-    json: Json = False,
-) -> None:
+@takes("preset budget image_size holdout device threads seed poses config pairs quiet json")
+def compare(place: Place, depth: Depth = "auto", *, options: Options) -> None:
     """Make the field, fitted and not, and the TSDF surface, score all on the same test views, and put them side by side on one page.
 
     With the folder of an earlier run its results are used as they are. A capture with `ground_truth/mesh.ply` has its meshes measured.
     """
-    from fieldfuse.pipelines.thread_limits import bound_threads
-
-    flags = {"budget": budget, "image_size": image_size, "holdout": holdout, "device": device, "threads": threads, "seed": seed}
-    wanted = list(pairs or [])
-    if out is not None and not any(pair.startswith("export.formats=") for pair in wanted):
-        wanted.insert(0, FORMATS)
-    if out is not None and (depth == "auto" or "matching" in depth) and not any(pair.startswith("fit.depth_from=") for pair in wanted):
-        wanted.insert(0, DEPTH_FROM)
-    options = gather(preset, config, wanted, **flags, **{"poses.source": poses})
-    bound_threads(options)
-    from fieldfuse.evaluation.terminal import comparison_text
+    added = [] if place.out is None else [FORMATS]
+    if place.out is not None and (depth == "auto" or "matching" in depth):
+        added.append(DEPTH_FROM)
+    settings = options.settings(*added)  # what --set says comes later, and wins
+    bound_threads(settings)
     from fieldfuse.pipelines.comparison import compare_run
-    from fieldfuse.pipelines.console import columns, make_progress
+    from fieldfuse.pipelines.console import make_progress
 
-    data = compare_run(target, out, options, depth, make_progress(quiet))
-    if json:
-        sys.stdout.write(writer.dumps(data, indent=1) + "\n")
-    elif not quiet:
-        notes = "".join(f"note: {warning}\n" for warning in data["warnings"])
-        sys.stdout.write(f"{comparison_text(data, columns(sys.stdout))}{notes}{(out or target) / 'compare.html'}\n")
+    data = compare_run(place, settings, depth, make_progress(options.quiet))
+    show(data, options, lambda: lines(data, place.folder))
+
+
+def lines(data: dict[str, Any], folder: Path) -> Iterator[str]:
+    """The table, remarks, and where the page is."""
+    from fieldfuse.evaluation.terminal import comparison_text
+    from fieldfuse.pipelines.console import columns
+
+    yield comparison_text(data, columns(sys.stdout)).removesuffix("\n")
+    yield from (f"note: {warning}" for warning in data["warnings"])
+    yield str(folder / "compare.html")

@@ -11,26 +11,33 @@ import numpy as np
 
 from fieldfuse.errors import InputError
 from fieldfuse.files import write_json
-from fieldfuse.memory_limits import require_meshes, require_scores
-from fieldfuse.pipelines.fit_files import fit_matched
+from fieldfuse.memory import require_meshes, require_scores
+from fieldfuse.pipelines.console import ConsoleProgress
+from fieldfuse.pipelines.exports import Wish, export_results
+from fieldfuse.pipelines.fields import (
+    DIRECT,
+    Fitted,
+    fit_radiance_field,
+    make_network_field,
+    render_network_views,
+    render_test_views,
+    starting_field,
+)
 from fieldfuse.pipelines.job import Job, open_job
-from fieldfuse.pipelines.kept import COMPARED, read_kept
-from fieldfuse.pipelines.reconstruct import BEFORE, FOR_FIELD, RESULTS, stand
+from fieldfuse.pipelines.options import Place
+from fieldfuse.pipelines.prepare import BEFORE, Prepared, prepare
+from fieldfuse.pipelines.reconstruct import FOR_FIELD, RESULTS
 from fieldfuse.pipelines.rendered import Pictures
-from fieldfuse.pipelines.steps_network import DIRECT, make_network_field, render_network_views
-from fieldfuse.pipelines.steps_results import export_results, fit_radiance_field, fuse_tsdf, render_test_views
-from fieldfuse.pipelines.steps_stereo import match_pictures
+from fieldfuse.pipelines.schemas import CompareScores, read_checked
+from fieldfuse.pipelines.stages import Stage
 from fieldfuse.pipelines.summary import base_data, warnings_of
-from fieldfuse.progress import Progress
+from fieldfuse.pipelines.surfaces import fuse_tsdf, match_images
 
 if TYPE_CHECKING:
     from fieldfuse.camera import Array
-    from fieldfuse.capture.types import Capture, Views
+    from fieldfuse.capture.types import Capture
     from fieldfuse.evaluation.compare_meshes import MeshPictures
     from fieldfuse.evaluation.compare_truth import GroundTruth
-    from fieldfuse.poses.result import PoseResult
-    from fieldfuse.poses.scene import Scene
-    from fieldfuse.render.field import Field
     from fieldfuse.tsdf.mesh import Mesh
 
 SURFACES = {"sensor": "tsdf", "matching": "tsdf_stereo", "exact": "tsdf_exact"}  # where depth comes from → stage and folder
@@ -55,12 +62,8 @@ class Compared:
     """Everything that the page is made of."""
 
     job: Job
-    capture: Capture
-    poses: PoseResult
-    posed: Capture
-    scene: Scene
-    views: Views
-    field: Field
+    ready: Prepared
+    fitted: Fitted
     renders: dict[str, Pictures]  # by method, the field first
     truth: GroundTruth | None
 
@@ -70,7 +73,7 @@ class Compared:
 
         if self.truth is None or not self.truth.depths:
             return None
-        return true_depths(self.truth, self.posed, self.views, indices, self.scene.working_from_input.scale)
+        return true_depths(self.truth, self.ready.posed, self.ready.views, indices, self.ready.scene.working_from_input.scale)
 
     def mesh_files(self) -> dict[str, Path]:
         """The meshes that there are, in the input's frame."""
@@ -84,18 +87,18 @@ class Compared:
         meshes = {}
         for name, path in self.mesh_files().items():
             try:
-                meshes[name] = read_mesh(path).transformed(self.scene.working_from_input)
+                meshes[name] = read_mesh(path).transformed(self.ready.scene.working_from_input)
             except InputError:  # an empty surface is a result, too
                 continue
         true = None if self.truth is None else self.truth.mesh
-        return meshes, None if true is None else read_mesh(true).transformed(self.scene.working_from_input)
+        return meshes, None if true is None else read_mesh(true).transformed(self.ready.scene.working_from_input)
 
     def voxel(self) -> float:
         """The voxel that distances are counted in, working units: that of the surface made of the best depth."""
         return float(next(self.renders[name].facts for name in ("tsdf_exact", "tsdf", "tsdf_stereo") if name in self.renders)["voxel_size"])
 
 
-def compare_run(target: Path, out: Path | None, options: dict[str, Any], depth: str, progress: Progress) -> dict[str, Any]:
+def compare_run(place: Place, options: dict[str, Any], depth: str, progress: ConsoleProgress) -> dict[str, Any]:
     """Make what is missing and write the comparison; answers `compare.json`.
 
     Raises:
@@ -105,20 +108,21 @@ def compare_run(target: Path, out: Path | None, options: dict[str, Any], depth: 
     from fieldfuse.steps import network_weights
 
     start = time.monotonic()
-    with open_job(target, out, options, progress, (*BEFORE, *FOR_FIELD, *RESULTS, *SURFACES.values())) as job:
-        capture, poses, posed, scene, views = stand(job)
-        if not views.test.any():
+    with open_job(place, options, progress, (*BEFORE, *FOR_FIELD, *RESULTS, *SURFACES.values())) as job:
+        ready, settings = prepare(job), job.settings
+        if not ready.views.test.any():
             raise InputError("a comparison needs images that were kept for testing; give --holdout 8")
-        truth, settings = find_truth(posed) if poses.source == "given" else None, job.settings
-        surfaces = {SURFACES[kind]: kind for kind in choose_surfaces(depth, posed, truth)}
-        fused = {name: fuse_tsdf(job, posed, scene, views, name, kind) for name, kind in surfaces.items()}
-        field, _ = fit_radiance_field(job, views, scene)
-        renders = {"field": render_test_views(job, field, views, scene)}
+        truth = find_truth(ready.posed) if ready.poses.source == "given" else None
+        surfaces = {SURFACES[kind]: kind for kind in choose_surfaces(depth, ready.posed, truth)}
+        fused = {name: fuse_tsdf(job, ready, name, kind) for name, kind in surfaces.items()}
+        network = starting_field(job, ready)
+        fitted = fit_radiance_field(job, ready, network)
+        renders = {"field": render_test_views(job, ready, fitted.field)}
         # The networks' field without any fitting is a method of its own, where it is wanted and is not the field itself.
         if settings.field.init != "classical" and settings.fit.finetune and network_weights(settings).is_file():
-            renders["direct"] = render_network_views(job, make_network_field(job, views, scene), views, scene, keep=True)
-        facts = export_results(job, field, poses, posed, scene, views)
-        it = Compared(job, capture, poses, posed, scene, views, field, renders | fused, truth)
+            renders["direct"] = render_network_views(job, ready, network or make_network_field(job, ready), keep=True)
+        facts = export_results(job, ready, fitted, Wish())
+        it = Compared(job, ready, fitted, renders | fused, truth)
         return put_comparison(it, measure(it), facts.get("mesh"), start)
 
 
@@ -154,13 +158,15 @@ def measure(it: Compared) -> dict[str, Any]:
         write_json(path, value)
         return [path]
 
-    return it.job.stages.run(
-        "compare",
-        make=lambda: {"scores": score_methods(it), **measure_meshes(it), "matching": measure_matching(it)},
-        save=save,
-        load=lambda: read_kept(path, COMPARED),
-        uses=list(it.renders),
-        after=["views", "render", "export", *(name for name in it.renders if name != "field")],
+    return it.job.run(
+        Stage(
+            "compare",
+            make=lambda: {"scores": score_methods(it), **measure_meshes(it), "matching": measure_matching(it)},
+            save=save,
+            load=lambda: read_checked(path, CompareScores),
+            inputs=["views", "render", "export", *(name for name in it.renders if name != "field")],
+            settings=list(it.renders),
+        )
     )
 
 
@@ -169,11 +175,11 @@ def score_methods(it: Compared) -> dict[str, Any]:
     from fieldfuse.evaluation.report import plain
     from fieldfuse.evaluation.score import compare_views
 
-    require_scores(it.views, len(it.renders))
+    require_scores(it.ready.views, len(it.renders))
     it.job.progress.update(0, 2, "pictures")
-    indices, renders = np.flatnonzero(it.views.test), {name: shown.pictures for name, shown in it.renders.items()}
+    indices, renders = np.flatnonzero(it.ready.views.test), {name: shown.pictures for name, shown in it.renders.items()}
     seconds = {name: shown.seconds for name, shown in it.renders.items()}
-    scores: dict[str, Any] = plain(compare_views(renders, it.views, indices, seconds, it.exact_depths(indices)))
+    scores: dict[str, Any] = plain(compare_views(renders, it.ready.views, indices, seconds, it.exact_depths(indices)))
     return scores
 
 
@@ -183,10 +189,10 @@ def measure_matching(it: Compared) -> dict[str, Any] | None:
 
     if "tsdf_stereo" not in it.renders:
         return None
-    training = np.flatnonzero(~it.views.test)
-    views = it.views.subset(training)
+    training = np.flatnonzero(~it.ready.views.test)
+    views = it.ready.training
     known = it.exact_depths(training) or views.depths
-    return matched_depth_scores(views, match_pictures(it.job, it.scene, it.views), known) if known else None
+    return matched_depth_scores(views, match_images(it.job, it.ready), known) if known else None
 
 
 def measure_meshes(it: Compared) -> dict[str, Any]:
@@ -200,7 +206,7 @@ def measure_meshes(it: Compared) -> dict[str, Any]:
     meshes, truth = it.meshes()
     if truth is None:
         return {"geometry": None, "seen_share": None}
-    views, scene, voxel, scale = it.views, it.scene, it.voxel(), it.scene.working_from_input.scale
+    views, scene, voxel, scale = it.ready.views, it.ready.scene, it.voxel(), it.ready.scene.working_from_input.scale
     training = np.flatnonzero(~views.test)
     region = (scene.centre - scene.half_size, scene.centre + scene.half_size)
     lenses = [views.intrinsics[index] for index in training]
@@ -225,7 +231,7 @@ def put_comparison(it: Compared, found: dict[str, Any], mesh_facts: dict[str, An
     from fieldfuse.evaluation.machine import machine
     from fieldfuse.evaluation.pictures import method_pictures
 
-    job, views, scene = it.job, it.views, it.scene
+    job, views, scene = it.job, it.ready.views, it.ready.scene
     indices = np.flatnonzero(views.test)
     exact = it.exact_depths(indices)
     if exact is not None:
@@ -235,7 +241,7 @@ def put_comparison(it: Compared, found: dict[str, Any], mesh_facts: dict[str, An
         views = replace(views, depths=depths)
     scale = next((score["depth_scale"] for score in found["scores"].values() if score["depth_scale"] is not None), None)
     top = None if scale is None else DEPTH_ERROR_TOP * scale
-    warnings = warnings_of(job, it.capture, it.poses, scene, it.views)
+    warnings = warnings_of(job, it.ready, it.fitted)
     matched = it.renders.get("tsdf_stereo")
     share = None if matched is None else matched.facts.get("depth_share")
     if share is not None and share < LITTLE_DEPTH:
@@ -245,7 +251,7 @@ def put_comparison(it: Compared, found: dict[str, Any], mesh_facts: dict[str, An
             " fit them; --poses sfm finds others",
         ]
     data = {
-        **base_data(job, it.capture, it.poses),
+        **base_data(job, it.ready.capture, it.ready.poses),
         "warnings": warnings,
         "scene": scene.to_dict(),
         "truth": {
@@ -257,7 +263,7 @@ def put_comparison(it: Compared, found: dict[str, Any], mesh_facts: dict[str, An
         "methods": [describe_method(it, name, found, mesh_facts) for name in it.renders],
         "matching": found["matching"],
         "machine": machine(job.settings.threads, job.settings.device),
-        "seconds_total": round(time.monotonic() - start + job.stages.fresh_seconds(), 3),
+        "seconds_total": round(time.monotonic() - start + job.stages.reused_seconds(), 3),
     }
     shown = {name: renders.pictures for name, renders in it.renders.items()}
     tiles = method_pictures(views, indices, shown, "m" if scene.metric else "units", SHOWN_VIEWS, top)
@@ -273,9 +279,9 @@ def describe_method(it: Compared, name: str, found: dict[str, Any], mesh_facts: 
         fit = it.job.settings.fit
         if "stereo" in it.job.stages.records["field"].after:
             own, note = ("stereo", *own), "fitted to colours and matched depth"
-        elif fit.finetune and fit.depth > 0 and fit.depth_from != "off" and any(depth is not None for depth in it.views.depths):
+        elif fit.finetune and fit.depth > 0 and fit.depth_from != "off" and any(depth is not None for depth in it.ready.views.depths):
             note = "fitted to colours and the sensor's depth"
-        elif fit_matched(it.job) is not None:
+        elif it.fitted.matched is not None:
             note = "fitted to colours and depth by quick matching"
     path, facts = it.job.folder / FILES.get(name, f"{name}/mesh.ply"), it.renders[name].facts
     return {
@@ -286,7 +292,7 @@ def describe_method(it: Compared, name: str, found: dict[str, Any], mesh_facts: 
         "stages": [stages[stage] for stage in own if stage in stages],
         "mesh_seconds": stages["export"]["seconds"] if is_field else None,
         "disk_bytes": path.stat().st_size if path.is_file() else None,
-        "memory_bytes": it.field.bytes if is_field else facts.get("bytes"),
+        "memory_bytes": it.fitted.field.bytes if is_field else facts.get("bytes"),
         "score": found["scores"].get(name),
         "geometry": (found["geometry"] or {}).get(name),
         "mesh": mesh_facts if is_field else facts.get("mesh"),
@@ -301,7 +307,7 @@ def shown_meshes(it: Compared) -> list[MeshPictures]:
     meshes, truth = it.meshes()
     if not meshes:
         return []
-    views, scene, voxel = it.views, it.scene, it.voxel()
+    views, scene, voxel = it.ready.views, it.ready.scene, it.voxel()
     outside = ("Seen from outside", *from_outside(scene.centre, scene.half_size, views.world_from_camera, MESH_SIDE, 3 * MESH_SIDE // 4))
     test = np.flatnonzero(views.test)
     index = int(test[len(test) // 2])

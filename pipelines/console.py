@@ -37,25 +37,29 @@ class ConsoleProgress(Progress):
         self.stream = stream or sys.stderr
         self._stop = threading.Event()
         self._phase = (0.0, 0.0, 0.0, "")  # when it began, done at that time, total, stage
-        self.stage = ""
-
-    # ---- what a pipeline calls
+        self.name = ""
 
     def begin(self, stage: str) -> None:
         """A stage starts."""
-        self.stage = stage
+        self.name = stage
         self._phase = (time.monotonic(), 0.0, 0.0, stage)
 
     def finish(self, stage: str, seconds: float, cached: bool) -> None:
         """A stage is finished, or was found finished."""
+
+    @contextmanager
+    def stage(self, name: str) -> Iterator[None]:
+        """Work that is one stage."""
+        self.begin(name)
+        start = time.monotonic()
+        yield
+        self.finish(name, time.monotonic() - start, cached=False)
 
     def say(self, text: str) -> None:
         """A remark of its own line."""
 
     def close(self) -> None:
         """Leave the terminal as it was."""
-
-    # ---- what long work calls
 
     def stopping(self) -> bool:
         return self._stop.is_set()
@@ -72,8 +76,8 @@ class ConsoleProgress(Progress):
         """Estimate from the pace since this count began; None while it is too early to say."""
         began, first, known, stage = self._phase
         now = time.monotonic()
-        if total != known or done < first or stage != self.stage:
-            self._phase = (now, done, total, self.stage)
+        if total != known or done < first or stage != self.name:
+            self._phase = (now, done, total, self.name)
             return None
         if done <= first or now - began < 0.5:
             return None
@@ -157,7 +161,7 @@ class PlainProgress(ConsoleProgress):
         self._last = now
         share = f" {100 * done / total:.0f}%" if total > 0 else ""
         rest = f", {clock(left)} left" if left is not None else ""
-        self.say(f"{self.stage}{share}{rest}{f', {note}' if note else ''}")
+        self.say(f"{self.name}{share}{rest}{f', {note}' if note else ''}")
 
     def finish(self, stage: str, seconds: float, cached: bool) -> None:
         self.say(f"{stage}: {'reused' if cached else f'{seconds:.1f} s'}")
@@ -225,12 +229,11 @@ def make_progress(quiet: bool = False, stream: IO[str] | None = None) -> Console
     return PlainProgress(stream)
 
 
-def show_table(data: dict[str, Any], stream: IO[str] | None = None) -> None:
+def table_lines(data: dict[str, Any]) -> Iterator[str]:
     """The report's numbers as one table."""
     from fieldfuse.evaluation.terminal import WIDEST, report_text  # rich and the metrics are needed only here
 
-    stream = stream or sys.stdout
-    stream.write(str(report_text(data, min(columns(stream) or WIDEST, WIDEST))).rstrip() + "\n")
+    yield str(report_text(data, min(columns(sys.stdout) or WIDEST, WIDEST))).rstrip()
 
 
 def columns(stream: IO[str]) -> int | None:

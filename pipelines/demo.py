@@ -6,7 +6,6 @@
 from __future__ import annotations
 
 import sys
-import time
 from pathlib import Path
 
 from fieldfuse.errors import FieldfuseError, Interrupted
@@ -17,23 +16,14 @@ from fieldfuse.simulate.demo import write_demo_video
 FOLDER = Path("demo")
 
 
-def film(video: Path) -> None:
-    """Write the demo's video unless it is there: with the same file, a second run reuses what the first one finished."""
-    if video.is_file():
-        return
-    progress = make_progress()
-    began = time.monotonic()
-    with progress.listening():
-        progress.begin("film")
-        write_demo_video(video, progress=progress)
-        progress.finish("film", time.monotonic() - began, cached=False)
-
-
 def main(folder: Path = FOLDER) -> None:
     """Make the capture in `folder` and reconstruct it into `folder`/run, with the options of the command line."""
     video = folder / "demo.mp4"
     try:
-        film(video)
+        if not video.is_file():  # with the same file, a second run reuses what the first one finished
+            progress = make_progress()
+            with progress.listening(), progress.stage("film"):
+                write_demo_video(video, progress=progress)
     except FieldfuseError as error:
         sys.stderr.write(f"fieldfuse: {error}\n")
         sys.exit(130 if isinstance(error, Interrupted) else 2)

@@ -7,7 +7,8 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from fieldfuse.steps import network_weights
+from fieldfuse import steps
+from fieldfuse.files import fingerprint
 
 if TYPE_CHECKING:
     from fieldfuse.capture.types import Views
@@ -34,24 +35,12 @@ class DirectField:
 
 def weights_state(settings: Settings) -> str:
     """Changes with the weights, so that results of earlier ones are not reused."""
-    from fieldfuse.files import fingerprint
-
-    return fingerprint(network_weights(settings))
+    return fingerprint(steps.network_weights(settings))
 
 
 def training_key_frames(views: Views, scene: Scene, settings: Settings) -> KeyFrames:
     """Key frames among the training views, as a run chooses them but for sharpness."""
-    from fieldfuse.nerfusion.keyframes import select_keyframes
-
-    train = np.flatnonzero(~np.asarray(views.test))
-    return select_keyframes(
-        views.world_from_camera[train],
-        [views.intrinsics[int(index)] for index in train],
-        scene.median_depth,
-        method=settings.keyframes.method,
-        every=settings.keyframes.every,
-        most=settings.keyframes.most,
-    )
+    return steps.key_frames(views, scene, settings, sharp=False)
 
 
 def direct_field(
@@ -60,23 +49,22 @@ def direct_field(
     """Fuse the key frames (about `share` of them, evenly spread) of the training views into a field.
 
     Args:
-        voxel_factor: voxels this many times as large as `network.voxels` asks for.
+        voxel_factor: voxels this many times as large as those of `network.voxels`.
 
     Raises:
         InputError: there is no training view, or no weights.
         Interrupted: the user asked to stop.
     """
     from fieldfuse.nerfusion.keyframes import KeyFrames
-    from fieldfuse.training.from_network import Inference, NetworkOptions, load_networks, voxels_to_median
+    from fieldfuse.training.from_network import NetworkOptions, voxels_to_median
 
     keys = training_key_frames(views, scene, settings)
     if share < 1:
-        kept = np.unique(np.linspace(0, len(keys.indices) - 1, max(1, round(share * len(keys.indices)))).round().astype(int))
-        keys = KeyFrames(keys.indices[kept], keys.neighbours[kept])
+        some = np.unique(np.linspace(0, len(keys.indices) - 1, max(1, round(share * len(keys.indices)))).round().astype(int))
+        keys = KeyFrames(keys.indices[some], keys.neighbours[some])
     options = NetworkOptions.of(settings.network)
-    options = replace(options, voxels=(options.voxels or voxels_to_median(views, options.measured)) / voxel_factor)
-    model = load_networks(network_weights(settings), settings.device)
-    inference = Inference(model, views, scene, keys, settings.field.background, options)
+    voxels = (options.voxels or voxels_to_median(views, options.measured)) / voxel_factor
+    inference = steps.direct_inference(views, scene, keys, settings, replace(options, voxels=voxels))
     for _ in inference.frames(progress):
         pass
     return DirectField(inference.result(progress, settings.engine), len(keys.indices), inference.lattice.voxel_size)

@@ -1,8 +1,9 @@
-"""What this machine has, what is missing, and what to do about it: a list of checks as plain data, and a table of them."""
+"""`fieldfuse doctor`: what this machine has, what is missing, and what to do about it; a list of checks as plain data, and a table."""
 
 from __future__ import annotations
 
 import importlib.metadata as metadata
+import json
 import os
 import re
 import shutil
@@ -10,28 +11,15 @@ import subprocess
 import sys
 import tempfile
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from pathlib import Path
 
+import typer
+
+from fieldfuse.pipelines.options import Options, takes
+
 OK, WARN, FAIL = "ok", "warn", "fail"
-PACKAGES = (
-    "numba",
-    "numpy",
-    "torch",
-    "opencv-contrib-python-headless",
-    "trimesh",
-    "fast-simplification",
-    "typer",
-    "rich",
-    "pydantic",
-    "matplotlib",
-    "safetensors",
-    "pillow",
-    "jinja2",
-    "pyyaml",
-    "scipy",
-    "psutil",
-)
+COLOURS = {OK: "green", WARN: "yellow", FAIL: "red"}
 # Shared libraries that Open3D loads, and the Debian packages that hold them.
 LIBRARIES = {
     "libusb-1.0": "libusb-1.0-0",
@@ -53,10 +41,13 @@ import pycolmap
 pycolmap.incremental_mapping, pycolmap.global_mapping, pycolmap.match_sequential
 print(pycolmap.__version__)
 """
-KERNELS = """
-from fieldfuse.pipelines.kernel_check import report
-print(report())
-"""
+KERNELS = "from fieldfuse.pipelines.kernel_check import report; print(report())"
+EXTRAS = (
+    ("viewer", "viser", "`fieldfuse view` is not there", "viser>=1"),
+    ("heic", "pillow-heif", "photos of phones in HEIC (.heic) are not read", "pillow-heif>=1"),
+    ("record3d", "imagecodecs", "recordings of Record3D with depth are not read", "imagecodecs>=2024.1"),
+    ("h264", "av", "videos are written as VP9, slowly, which not all players know", "av>=14"),
+)
 GIB = 2**30
 OLDEST_PYTHON = (3, 11)
 
@@ -71,11 +62,22 @@ class Check:
     advice: str = ""  # what to do; empty when the status is "ok"
 
 
+@takes("json")
+def doctor(options: Options) -> None:
+    """Look at this machine: libraries, versions, devices, and what to do about what is missing."""
+    checks = collect()
+    if options.json:
+        typer.echo(json.dumps([asdict(check) for check in checks], indent=1))
+    else:
+        show(checks)
+    if any(check.status == FAIL for check in checks):
+        raise typer.Exit(1)
+
+
 def collect() -> list[Check]:
     """Look at everything (a few seconds). Never raises: what goes wrong in a check is its finding."""
     checks = [_python(), *_packages()]
-    extras: tuple[Callable[[], Check], ...] = (_xfeat, _lpips, _viewer, _heic, _record3d, _h264)
-    looks: tuple[Callable[[], Check], ...] = (_open3d, _pycolmap, _torch, _kernels, _video, *extras, _cores, _memory, _disk)
+    looks: tuple[Callable[[], Check], ...] = (_open3d, _pycolmap, _torch, _kernels, _video, _xfeat, _lpips, _cores, _memory, _disk)
     for look in looks:
         try:
             checks.append(look())
@@ -91,17 +93,16 @@ def show(checks: list[Check]) -> None:
     from rich.table import Table
 
     console = Console(highlight=False)
-    colours = {OK: "green", WARN: "yellow", FAIL: "red"}
     table = Table(box=None, pad_edge=False, header_style="bold")
     for column in ("check", "", "found"):
         table.add_column(column, overflow="fold")
     for check in checks:
-        table.add_row(check.name, f"[{colours[check.status]}]{check.status}[/]", check.found.replace("[", r"\["))
+        table.add_row(check.name, f"[{COLOURS[check.status]}]{check.status}[/]", check.found.replace("[", r"\["))
     console.print(table)
     for status in (FAIL, WARN):
         for check in checks:
             if check.status == status:
-                console.print(f"\n[{colours[status]}]{status}[/] {check.name}: ", end="")
+                console.print(f"\n[{COLOURS[status]}]{status}[/] {check.name}: ", end="")
                 console.print(check.advice, markup=False, soft_wrap=True)
     if not any(check.status == FAIL for check in checks):
         console.print("\nFieldfuse can run here.")
@@ -115,20 +116,32 @@ def _python() -> Check:
 
 
 def _packages() -> list[Check]:
+    """Those that Fieldfuse requires (Open3D and pycolmap are tried in processes of their own), and the extras."""
     checks = []
-    for name in PACKAGES:
-        try:
-            checks.append(Check(name, OK, metadata.version(name)))
-        except metadata.PackageNotFoundError:
-            checks.append(Check(name, FAIL, "not installed", f"pip install --constraint constraints.txt {name}"))
+    for line in metadata.requires("fieldfuse") or ():
+        name = re.split(r"[<>=; ]", line)[0]
+        if "extra ==" in line or name in ("open3d", "open3d-cpu", "pycolmap"):
+            continue
+        version = _version(name)
+        advice = "" if version else f"pip install --constraint constraints.txt {name}"
+        checks.append(Check(name, OK if version else FAIL, version or "not installed", advice))
+    for name, package, without, ask in EXTRAS:
+        if version := _version(package):
+            checks.append(Check(name, OK, f"{package} {version}"))
+        else:
+            checks.append(Check(name, WARN, f"no {package}: {without}", f"pip install '{ask}'"))
     return checks
 
 
-def in_child(code: str, seconds: float = 120) -> tuple[bool, str]:
-    """Run Python code in a process of its own: whether it ended well, and the last line it wrote.
+def _version(package: str) -> str | None:
+    try:
+        return metadata.version(package)
+    except metadata.PackageNotFoundError:
+        return None
 
-    A library that aborts takes only that process with it.
-    """
+
+def in_child(code: str, seconds: float = 120) -> tuple[bool, str]:
+    """Run Python code in a process of its own, which a library that aborts takes with it: whether it ended well, and its last line."""
     try:
         done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, timeout=seconds, check=False)
     except subprocess.TimeoutExpired:
@@ -139,31 +152,22 @@ def in_child(code: str, seconds: float = 120) -> tuple[bool, str]:
     return done.returncode == 0, lines[-1].strip() if lines else "no message"
 
 
-def missing_library(message: str) -> str | None:
-    """The Debian package that holds the shared library that an import error names."""
-    named = re.search(r"(lib[\w.+-]+?\.so[\w.]*)", message)
-    if named is None:
-        return None
-    return next((package for start, package in LIBRARIES.items() if named[1].startswith(start)), f"the one that holds {named[1]}")
-
-
 def _open3d() -> Check:
-    good, said = in_child(OPEN3D)
+    good, found = in_child(OPEN3D)
     if good:
-        return Check("open3d", OK, f"{said}, block grids work")
-    package = missing_library(said)
-    if package is not None:
-        return Check("open3d", FAIL, said, f"a system library is missing: sudo apt-get install --yes {package} (or `make system`)")
-    if "No module named" in said:
+        return Check("open3d", OK, f"{found}, block grids work")
+    if library := re.search(r"(lib[\w.+-]+?\.so[\w.]*)", found):
+        package = next((name for start, name in LIBRARIES.items() if library[1].startswith(start)), f"the one that holds {library[1]}")
+        return Check("open3d", FAIL, found, f"a system library is missing: sudo apt-get install --yes {package} (or `make system`)")
+    if "No module named" in found:
         return Check("open3d", FAIL, "not installed", "pip install --constraint constraints.txt open3d-cpu (or open3d)")
-    return Check("open3d", FAIL, said, "install it again: pip install --force-reinstall --no-deps --constraint constraints.txt open3d-cpu")
+    return Check("open3d", FAIL, found, "install it again: pip install --force-reinstall --no-deps --constraint constraints.txt open3d-cpu")
 
 
 def _pycolmap() -> Check:
-    good, said = in_child(PYCOLMAP)
-    if good:
-        return Check("pycolmap", OK, said)
-    return Check("pycolmap", FAIL, said, "poses can only be read, not found, without it: pip install --constraint constraints.txt pycolmap")
+    good, found = in_child(PYCOLMAP)
+    advice = "poses can only be read, not found, without it: pip install --constraint constraints.txt pycolmap"
+    return Check("pycolmap", OK, found) if good else Check("pycolmap", FAIL, found, advice)
 
 
 def _torch() -> Check:
@@ -171,21 +175,20 @@ def _torch() -> Check:
 
     count = torch.get_num_threads()
     threads = f"{count} thread{'' if count == 1 else 's'}"
-    if torch.cuda.is_available():
-        from fieldfuse.backends.dispatch import triton_runs_on
+    if not torch.cuda.is_available():
+        return Check("torch device", OK, f"CPU with {threads}")
+    from fieldfuse.backends.dispatch import triton_runs_on
 
-        seen = f"CUDA, {torch.cuda.get_device_name(0)}; CPU with {threads}"
-        if triton_runs_on(torch.device("cuda")):
-            return Check("torch device", OK, seen)
-        return Check("torch device", WARN, f"{seen}; without Triton for it fits take forty times as long", "pip install triton")
-    return Check("torch device", OK, f"CPU with {threads}")
+    found = f"CUDA, {torch.cuda.get_device_name(0)}; CPU with {threads}"
+    if triton_runs_on(torch.device("cuda")):
+        return Check("torch device", OK, found)
+    return Check("torch device", WARN, f"{found}; without Triton for it fits take forty times as long", "pip install triton")
 
 
 def _kernels() -> Check:
-    good, said = in_child(KERNELS, 300)  # from an empty cache they are compiled first
-    if good:
-        return Check("kernels", OK, said)
-    return Check("kernels", FAIL, said, "install numba and torch again, from constraints.txt; `--engine torch` avoids compiled kernels")
+    good, found = in_child(KERNELS, 300)  # from an empty cache they are compiled first
+    advice = "install numba and torch again, from constraints.txt; `--engine torch` avoids compiled kernels"
+    return Check("kernels", OK, found) if good else Check("kernels", FAIL, found, advice)
 
 
 def _video() -> Check:
@@ -207,32 +210,6 @@ def _video() -> Check:
     if len(read) != len(frames) or max(abs(float(a.mean()) - float(b.mean())) for a, b in zip(read, frames, strict=True)) > 12:
         return Check("video", FAIL, "OpenCV does not read back the mp4 that it wrote", "install opencv-contrib-python-headless again")
     return Check("video", OK, "mp4 written and read")
-
-
-def _viewer() -> Check:
-    return _package("viewer", "viser", "`fieldfuse view` is not there", "pip install 'viser>=1'")
-
-
-def _heic() -> Check:
-    return _package("heic", "pillow-heif", "photos of phones in HEIC (.heic) are not read", "pip install 'pillow-heif>=1'")
-
-
-def _record3d() -> Check:
-    return _package("record3d", "imagecodecs", "recordings of Record3D with depth are not read", "pip install 'imagecodecs>=2024.1'")
-
-
-def _h264() -> Check:
-    return _package("h264", "av", "videos are written as VP9, slowly, which not all players know", "pip install 'av>=14'")
-
-
-def _package(name: str, package: str, without: str, ask: str) -> Check:
-    """A package that one thing needs and all else does without."""
-    from importlib.metadata import PackageNotFoundError, version
-
-    try:
-        return Check(name, OK, f"{package} {version(package)}")
-    except PackageNotFoundError:
-        return Check(name, WARN, f"no {package}: {without}", ask)
 
 
 def _xfeat() -> Check:

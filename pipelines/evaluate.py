@@ -2,20 +2,11 @@
 
 from __future__ import annotations
 
-from fieldfuse.pipelines.options import Config, Json, OptionalOut, Pairs, Quiet, Target, Threads, gather
+from fieldfuse.pipelines.options import Options, Place, takes
+from fieldfuse.pipelines.work import work
 
 
-def evaluate(
-    target: Target,
-    out: OptionalOut = None,
-    threads: Threads = None,
-    config: Config = None,
-    pairs: Pairs = None,
-    quiet: Quiet = False,
-    json: Json = False,
-) -> None:
+@takes("threads config pairs quiet json")
+def evaluate(place: Place, options: Options) -> None:
     """Render the held-out views, score them, and write the report."""
-    from fieldfuse.pipelines.reconstruct import BEFORE
-    from fieldfuse.pipelines.work import work
-
-    work(target, out, gather(None, config, pairs, threads=threads), ("render",), quiet=quiet, as_json=json, trusted=(*BEFORE, "field"))
+    work(place, options, ("render",), options.settings())

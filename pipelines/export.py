@@ -8,32 +8,25 @@ import typer
 
 from fieldfuse.config import EXPORTS, require_formats
 from fieldfuse.errors import InputError
-from fieldfuse.pipelines.options import Config, Json, OptionalOut, Pairs, Quiet, Target, Threads, gather
+from fieldfuse.pipelines.options import Options, Place, takes
+from fieldfuse.pipelines.work import work
 
 
+@takes("threads config pairs quiet json")
 def export(
-    target: Target,
-    out: OptionalOut = None,
+    place: Place,
     formats: Annotated[
         str | None, typer.Option(help="Comma-separated part of points,ply,obj,glb,texture,page,cameras,video.", show_default=False)
     ] = None,
-    threads: Threads = None,
-    config: Config = None,
-    pairs: Pairs = None,
-    quiet: Quiet = False,
-    json: Json = False,
+    *,
+    options: Options,
 ) -> None:
     """Write the field as files for other programs, in the input's own frame and scale, into DIR/exports.
 
     --formats is for this time: what else the run was asked for is not forgotten, and files that are there of the same field stay.
     """
-    from fieldfuse.pipelines.reconstruct import BEFORE
-    from fieldfuse.pipelines.work import work
-
     wanted = None if formats is None else [name.strip() for name in formats.split(",") if name.strip()]
     if wanted == []:
         raise InputError(f"--formats names none; give some of {', '.join(EXPORTS)}, separated by commas")
     require_formats(wanted or [], "--formats")
-    # Wanted now and not from now on: it is no setting of the run.
-    options = {**gather(None, config, pairs, threads=threads), "formats": wanted}
-    work(target, out, options, ("export",), quiet=quiet, as_json=json, trusted=(*BEFORE, "field"))
+    work(place, options, ("export",), options.settings(), formats=wanted)

@@ -22,36 +22,14 @@ from fieldfuse.files import atomic_path, read_json, remove, require_utf8, write_
 
 LOCK = ".lock"
 RUN = "run.json"
-ATTEMPTS = 10  # to lock a folder that another command is removing
 STAGES = "stages"
 ERROR_LOG = "error.log"
 SUBFOLDERS = (STAGES, "frames", "sparse", "renders", "tsdf", "stereo", "tsdf_stereo", "compare", "tradeoff", "exports")
 FILES = (
-    "capture.json",
-    "plan.json",
-    "poses.json",
-    "effects.json",
-    "scene.json",
-    "keyframes.json",
-    "views.safetensors",
-    "network.safetensors",
-    "network.json",
-    "direct.safetensors",
-    "preview.png",
-    "field.safetensors",
-    "timeline.json",
-    "fit_notes.json",
-    "fit_matched.json",
-    "left_out.safetensors",
-    "mesh.ply",
-    "evaluation.json",
-    "report.json",
-    "report.html",
-    "compare.json",
-    "compare.html",
-    "tradeoff.csv",
-    "tradeoff.json",
-    "tradeoff.html",
+    *("capture.json", "plan.json", "poses.json", "effects.json", "scene.json", "keyframes.json", "views.safetensors"),
+    *("network.safetensors", "network.json", "direct.safetensors", "preview.png", "field.safetensors", "timeline.json"),
+    *("fit_notes.json", "fit_matched.json", "left_out.safetensors", "mesh.ply", "evaluation.json", "report.json", "report.html"),
+    *("compare.json", "compare.html", "tradeoff.csv", "tradeoff.json", "tradeoff.html"),
 )
 BUSY = "another fieldfuse command is working in {}; wait for it to end or choose another --out folder"
 FOREIGN = "{} holds {!r} but no fieldfuse run; choose a new or empty --out folder so that nothing of yours is replaced"
@@ -88,16 +66,20 @@ class RunFolder:
         require_utf8(self.path)
         try:
             self._made = [place for place in (self.path, *self.path.parents) if not place.exists()]
-            self._take_lock()
+            self.path.mkdir(parents=True, exist_ok=True)
+            self._lock = (self.path / LOCK).open("a", encoding="utf-8")
+            fcntl.flock(self._lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
             self._held_run = is_run_folder(self.path)
-            self._check_ours()
+            if not self._held_run and (foreign := self._results()):  # of the same names, but without a run: somebody's data
+                self._unlock()
+                remove(self.path / LOCK)
+                raise OutputError(FOREIGN.format(self.path, foreign[0]))
             self._remove_leftovers()
             remove(self.path / ERROR_LOG)
-        except BlockingIOError as error:
-            self._unlock()
-            raise OutputError(BUSY.format(self.path)) from error
         except OSError as error:
             self._unlock()
+            if isinstance(error, BlockingIOError):
+                raise OutputError(BUSY.format(self.path)) from error
             reason = error.strerror or error
             raise OutputError(f"cannot write to {self.path}: {reason}; make it writable, or choose another --out folder") from error
         return self
@@ -115,24 +97,6 @@ class RunFolder:
                 self._take_back()
             self._unlock()
 
-    def _take_lock(self) -> None:
-        """Make the folder and lock it.
-
-        A command that was refused may be removing both (`_take_back`): then what was locked is no longer the file in the folder.
-
-        Raises:
-            BlockingIOError: another command holds the lock.
-        """
-        for _ in range(ATTEMPTS):
-            self.path.mkdir(parents=True, exist_ok=True)
-            with suppress(FileNotFoundError):  # gone again
-                self._lock = (self.path / LOCK).open("a", encoding="utf-8")
-                fcntl.flock(self._lock, fcntl.LOCK_EX | fcntl.LOCK_NB)
-                if os.path.samestat(os.fstat(self._lock.fileno()), (self.path / LOCK).stat()):
-                    return
-            self._unlock()
-        raise BlockingIOError
-
     def _take_back(self) -> None:
         """Remove what says that a run is here, and folders made for it, where the input was refused before anything else was written."""
         if self._held_run:
@@ -140,23 +104,13 @@ class RunFolder:
         with suppress(OSError):  # the refusal is what has to be told
             if not self._results():
                 remove(self.path / RUN)
-                remove(self.path / LOCK)  # still held: whoever opened it in between sees that it is gone
+                remove(self.path / LOCK)
                 for place in self._made:
                     place.rmdir()  # never one that holds something
 
     def _results(self) -> list[str]:
         """Names of a run's files and folders that are there, `run.json` aside."""
         return [name for name in (*SUBFOLDERS, *FILES) if (self.path / name).exists()]
-
-    def _check_ours(self) -> None:
-        """A folder with files of the same names as a run's, but without a run in it, is somebody's data."""
-        if self._held_run:
-            return
-        foreign = self._results()
-        if foreign:
-            self._unlock()
-            remove(self.path / LOCK)
-            raise OutputError(FOREIGN.format(self.path, foreign[0]))
 
     def _unlock(self) -> None:
         if self._lock is not None:

@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+import json as writer
+from collections import Counter
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
-from fieldfuse.pipelines.options import Json, Quiet
+from fieldfuse.pipelines.options import Options, takes
 
 if TYPE_CHECKING:
     from fieldfuse.capture.types import Capture
@@ -20,36 +22,34 @@ OUTDATED = (
     ({"render", "evaluate"}, "scores, pictures and the report are of an earlier field or surface; `fieldfuse evaluate {}` renews them"),
     ({"export"}, "the exports are of an earlier field; `fieldfuse export {}` renews them"),
 )
+STAGE = ("name", "seconds", "peak_memory_mb", "stopped")
+BESIDE = 140  # characters that a line must have for the evidence to stand in the table
 SHOWN = {"views": "views {}", "psnr": "PSNR {:.2f} dB", "ssim": "SSIM {:.3f}", "lpips": "LPIPS {:.3f}"}
 
 
+@takes("quiet json")
 def info(
     target: Annotated[Path, typer.Argument(metavar="SOURCE", help="A source, or the folder of an earlier run.", show_default=False)],
     fast: Annotated[bool, typer.Option("--fast", help="Read headers only; pictures are not looked at for damage.")] = False,
     effects: Annotated[bool, typer.Option("--effects", help="Look for effects of camera and light, with the evidence of each.")] = False,
-    quiet: Quiet = False,
-    json: Json = False,
+    *,
+    options: Options,
 ) -> None:
     """Tell what was detected: kind, counts, sizes, lenses, depth, warnings."""
     from fieldfuse.pipelines.folder import is_run_folder
 
-    data = run_facts(target) if is_run_folder(target) else source_facts(target, fast, quiet or json)
+    quiet = options.quiet or options.json
+    data = run_facts(target) if is_run_folder(target) else source_facts(target, fast, quiet)
     if effects:
-        from fieldfuse.pipelines.effects_table import effects_facts
-
-        data["effects"] = effects_facts(target, quiet or json)
-    if json:
-        import json as writer
-
+        data["effects"] = effects_facts(target, quiet)
+    if options.json:
         typer.echo(writer.dumps(data, indent=1))
-    else:
-        if effects:
-            from fieldfuse.pipelines.effects_table import show
-
-            show(data.pop("effects"))
-        for key, value in for_people(data).items():
-            for line in lines(key, value):
-                typer.echo(line)
+        return
+    if effects:
+        show_effects(data.pop("effects"))
+    for key, value in for_people(data).items():
+        for line in lines(key, value):
+            typer.echo(line)
 
 
 def source_facts(source: Path, fast: bool, quiet: bool) -> dict[str, Any]:
@@ -102,10 +102,7 @@ def check_poses(capture: Capture, progress: Progress) -> tuple[str | None, list[
 
 def lenses(capture: Capture) -> list[dict[str, Any]]:
     """The different cameras that the source names, each with how many frames have it."""
-    found: dict[Any, int] = {}
-    for frame in capture.frames:
-        if frame.intrinsics is not None:
-            found[frame.intrinsics] = found.get(frame.intrinsics, 0) + 1
+    found = Counter(frame.intrinsics for frame in capture.frames if frame.intrinsics is not None)
     return [{"frames": count, **camera.to_dict()} for camera, count in found.items()]
 
 
@@ -126,32 +123,23 @@ def run_facts(folder: Path) -> dict[str, Any]:
         "report": str(page) if page.is_file() else None,
         "scores": scores_of(run / "evaluation.json"),
         "outdated": [text.format(folder) for stages, text in OUTDATED if stages & old],
-        "stages": [
-            {
-                "name": record.name,
-                "seconds": record.seconds,
-                "peak_memory_mb": record.peak_memory_mb,
-                "stopped": record.stopped,
-                "outdated": record.name in old,
-            }
-            for record in records
-        ],
+        "stages": [{**{name: getattr(record, name) for name in STAGE}, "outdated": record.name in old} for record in records],
     }
 
 
 def scores_of(path: Path) -> dict[str, dict[str, float]]:
-    """What was scored, and how well; empty when nothing was, or the file cannot be read: the run's other facts are told all the same."""
+    """What was scored, and how well; empty when nothing was, or the file cannot be read: the run's other facts are shown all the same."""
     from fieldfuse.errors import InputError
-    from fieldfuse.pipelines.kept import EVALUATION, read_kept
+    from fieldfuse.pipelines.schemas import EVALUATION, read_checked
 
     try:
-        scores = read_kept(path, EVALUATION)
+        scores = read_checked(path, EVALUATION)
     except InputError:
         return {}
     return {
         what: {name: score[name] for name in SHOWN if score.get(name) is not None}
         for what, score in scores.items()
-        if score is not None and score.get("psnr") is not None
+        if score.get("psnr") is not None
     }
 
 
@@ -162,8 +150,9 @@ def for_people(data: dict[str, Any]) -> dict[str, Any]:
         shown["extra"] = {name: value for name, value in shown["extra"].items() if shown.get(name) != value}
     if "stages" in shown:
         words = {"stopped": " (stopped early)", "outdated": " (out of date)"}
-        told = [f"{one['name']} {one['seconds']:.1f} s" + "".join(words[name] for name in words if one[name]) for one in shown["stages"]]
-        shown["stages"] = ", ".join(told)
+        shown["stages"] = ", ".join(
+            f"{one['name']} {one['seconds']:.1f} s" + "".join(words[name] for name in words if one[name]) for one in shown["stages"]
+        )
     if "scores" in shown:
         shown["scores"] = [
             f"{what.replace('_', ' ')}: " + ", ".join(SHOWN[name].format(value) for name, value in of.items())
@@ -174,19 +163,91 @@ def for_people(data: dict[str, Any]) -> dict[str, Any]:
 
 def lines(key: str, value: Any) -> list[str]:
     """One fact as lines for people; what is empty or unknown is left out."""
-    name = key.replace("_", " ")
     if value is None or value == [] or value == {} or value is False:
         return []
     if isinstance(value, dict):
         return [line for inner, entry in value.items() for line in lines(inner, entry)]
-    if isinstance(value, list) and isinstance(value[0], dict):
-        shown = value[:4] + ([{"and": f"{len(value) - 4} more"}] if len(value) > 4 else [])
-        return [f"{name:<14} " + ", ".join(f"{inner} {number(entry)}" for inner, entry in part.items()) for part in shown]
-    if isinstance(value, list):
-        return [f"{name:<14} {entry}" for entry in value]
-    return [f"{name:<14} {'yes' if value is True else number(value)}"]
+    shown = value if isinstance(value, list) else ["yes" if value is True else value]
+    if isinstance(shown[0], dict):
+        rest = [{"and": f"{len(shown) - 4} more"}] if len(shown) > 4 else []
+        shown = [", ".join(f"{inner} {number(entry)}" for inner, entry in part.items()) for part in [*shown[:4], *rest]]
+    return [f"{key.replace('_', ' '):<14} {number(entry)}" for entry in shown]
 
 
 def number(value: Any) -> str:
     """Fractions with six digits, all else as it is."""
     return f"{value:.6g}" if isinstance(value, float) else str(value)
+
+
+def effects_facts(target: Path, quiet: bool) -> dict[str, Any]:
+    """What an earlier run found, or what its pictures and given poses show now.
+
+    Raises:
+        InputError: a source without poses: shared points cannot be told from wrong matches without them.
+    """
+    from fieldfuse.capture import open_capture
+    from fieldfuse.effects.depth_camera import DEPTH_OFFSET, look_for_offset
+    from fieldfuse.effects.diagnostics import diagnose
+    from fieldfuse.errors import InputError
+    from fieldfuse.pipelines.console import make_progress
+    from fieldfuse.pipelines.folder import is_run_folder
+    from fieldfuse.pipelines.schemas import Effects, read_checked
+
+    if is_run_folder(target):
+        if not (target / "effects.json").is_file():
+            raise InputError(f"{target} holds no effects.json; run the job again without effects=off")
+        return {key: value for key, value in read_checked(target / "effects.json", Effects).items() if key != "corrections"}
+    capture = open_capture(target)
+    posed = [frame for frame in capture.frames if frame.world_from_camera is not None and frame.intrinsics is not None]
+    if len(posed) < 3:
+        raise InputError(
+            f"{target} comes without camera poses, which the evidence needs; find them first: fieldfuse poses {target} --out DIR, "
+            "copy DIR/exports/cameras/transforms.json into the capture's folder, then fieldfuse info THERE/transforms.json --effects"
+        )
+    progress = make_progress(quiet)
+    with progress.listening():
+        progress.begin("effects")
+        shown = capture.with_frames(posed)
+        found = diagnose(shown, progress=progress)
+        findings = dict(found.findings)
+        if shown.has_depth:
+            with found.timing.by(DEPTH_OFFSET):
+                findings[DEPTH_OFFSET] = look_for_offset(shown, range(len(posed)), found.seen, progress)[0]
+    progress.finish("effects", found.seconds + found.timing.of(DEPTH_OFFSET), False)
+    return {
+        "effects": [{**finding.to_dict(), "seconds": found.timing.of(name)} for name, finding in findings.items()],
+        "seconds": round(found.seconds + found.timing.of(DEPTH_OFFSET), 3),
+        "looked_at": found.facts,
+    }
+
+
+def show_effects(data: dict[str, Any]) -> None:
+    """The table on standard output, one effect a row; where lines are short what speaks for each stands below it."""
+    from rich.console import Console
+    from rich.table import Table
+    from rich.text import Text
+
+    from fieldfuse.evaluation.words import significant
+
+    console = Console(highlight=False)
+    if not console.is_terminal:
+        console = Console(highlight=False, width=180)
+    beside = console.width >= BESIDE
+    table = Table(box=None, pad_edge=False, header_style="bold")
+    for column in ("effect", "there", "number", "threshold", "held out", "s", *(["evidence"] if beside else [])):
+        table.add_column(column, justify="right" if column in ("number", "threshold", "held out", "s") else "left", overflow="fold")
+    for entry in data["effects"]:
+        held = entry.get("held_out")
+        change = "" if held is None else f"{significant(held['before'])} → {significant(held['after'])} {held['unit']}"
+        there = "yes" if entry["there"] else "no"
+        paid = f"{entry['seconds']:.2f}" if "seconds" in entry else ""
+        last = [Text(entry["reason"])] if beside else []
+        table.add_row(entry["effect"], there, f"{entry['number']:.3f}", f"{entry['threshold']:g}", change, paid, *last)
+    console.print(table)
+    if not beside:
+        for entry in data["effects"]:
+            console.print(f"\n{entry['effect']}: {entry['reason']}", markup=False)
+        console.print()
+    about = data["looked_at"]
+    points = f", {about['points_seconds']:.1f} s of it for finding these points" if "points_seconds" in about else ""
+    console.print(f"{about['frames']} pictures and {about['points']} shared points looked at in {data['seconds']:.1f} s{points}")

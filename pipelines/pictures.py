@@ -69,7 +69,7 @@ def baked(job: Job, field: Field, views: Views, seen: float | None = None) -> Ba
     Raises:
         InputError: a decoder that cannot be baked.
     """
-    from fieldfuse.memory_limits import require_baking
+    from fieldfuse.memory import require_baking
     from fieldfuse.render.bake import SEEN, bake, seen_voxels
 
     field = field.to("cpu")

@@ -2,22 +2,11 @@
 
 from __future__ import annotations
 
-from fieldfuse.pipelines.options import Config, Json, OptionalOut, Pairs, PosesFrom, Quiet, Seed, Target, Threads, gather
+from fieldfuse.pipelines.options import Options, Place, takes
+from fieldfuse.pipelines.work import work
 
 
-def poses(
-    target: Target,
-    out: OptionalOut = None,
-    source: PosesFrom = None,
-    threads: Threads = None,
-    seed: Seed = None,
-    config: Config = None,
-    pairs: Pairs = None,
-    quiet: Quiet = False,
-    json: Json = False,
-) -> None:
+@takes("poses threads seed config pairs quiet json")
+def poses(place: Place, options: Options) -> None:
     """Find (or read) the camera poses and write them as transforms.json and COLMAP text."""
-    from fieldfuse.pipelines.work import work
-
-    options = gather(None, config, pairs, threads=threads, seed=seed, **{"poses.source": source})
-    work(target, out, options, (), quiet=quiet, as_json=json, trusted=("capture", "frames"))
+    work(place, options, (), options.settings())

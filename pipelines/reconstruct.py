@@ -1,118 +1,110 @@
-"""The main job: capture → poses → key frames → views → TSDF surface and radiance field → pictures → exports → report."""
+"""The main job: capture → poses → key frames → views → TSDF surface and radiance field → renders → exports → report."""
 
 from __future__ import annotations
 
 import time
 from collections.abc import Iterable
-from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 from fieldfuse.pipelines.console import ConsoleProgress
+from fieldfuse.pipelines.exports import TEXTURE, Wish, export_results, require_originals
+from fieldfuse.pipelines.fields import (
+    fit_radiance_field,
+    make_network_field,
+    render_network_views,
+    render_test_views,
+    score_pictures,
+    uses_network,
+)
 from fieldfuse.pipelines.job import Job, open_job
-from fieldfuse.pipelines.steps_capture import choose_frames, choose_keyframes, find_camera_poses, find_capture, make_views, measure_scene
-from fieldfuse.pipelines.steps_effects import find_effects
-from fieldfuse.pipelines.steps_network import make_network_field, render_network_views, uses_network
-from fieldfuse.pipelines.steps_results import export_results, fit_radiance_field, fuse_tsdf, render_test_views, score_pictures, wants_tsdf
-from fieldfuse.pipelines.steps_stereo import reuse_matched
-from fieldfuse.pipelines.summary import put_report, summarise_poses
-from fieldfuse.pipelines.taken import TEXTURE, require_originals
+from fieldfuse.pipelines.options import Place
+from fieldfuse.pipelines.prepare import BEFORE, Prepared, choose_frames, find_camera_poses, find_capture, prepare
+from fieldfuse.pipelines.summary import Results, put_report, summarise_poses
+from fieldfuse.pipelines.surfaces import fuse_tsdf, match_images
 from fieldfuse.pipelines.textured import TSDF_TEXTURE, texture_tsdf
-from fieldfuse.steps import refined
+from fieldfuse.pipelines.total_budget import TotalBudget
 
-if TYPE_CHECKING:
-    from fieldfuse.capture.types import Capture, Views
-    from fieldfuse.poses.result import PoseResult
-    from fieldfuse.poses.scene import Scene
-
-BEFORE = ("capture", "frames", "poses", "effects", "scene", "keyframes", "views")  # what every result stands on
 RESULTS = ("tsdf", "field", "render", "export")
 FOR_FIELD = ("network", "direct")  # made with the field
-ALL = frozenset(RESULTS)
 
 
 def run_job(
-    target: Path,
-    out: Path | None,
+    place: Place,
     options: dict[str, Any],
     goals: Iterable[str],
     progress: ConsoleProgress,
-    trusted: Iterable[str] = BEFORE,
+    *,
     go_on: bool = False,
+    formats: list[str] | None = None,
+    total_budget: float | None = None,
 ) -> dict[str, Any]:
-    """Open the run's folder and make `goals` in it, with all that they need; see `open_job` for the arguments."""
-    with open_job(target, out, options, progress, trusted) as job:
-        if options.get("total_budget") is not None:
-            from fieldfuse.pipelines.total_budget import TotalBudget
+    """Open the run's folder and make `goals` (a part of `RESULTS`; none: camera poses alone) in it, with all that they need.
 
-            job.plan = TotalBudget(options["total_budget"])
-        wanted = frozenset(goals)
-        job.formats, job.alone = options.get("formats"), wanted == {"export"}
-        return reconstruct(job, wanted, go_on) if wanted else reconstruct_poses(job)
+    Args:
+        options: as for `open_job`.
+        go_on: a field that the folder has is fitted further.
+        formats: to be exported this time, whatever the settings are.
+        total_budget: seconds for all of it.
 
-
-def stand(job: Job) -> tuple[Capture, PoseResult, Capture, Scene, Views]:
-    """What every result stands on: capture, poses, the posed capture (as far as it takes part), the scene, and the views made ready."""
-    from fieldfuse.capture.subset import limited
-
-    capture = find_capture(job)
-    if job.plan is not None:
-        job.plan.choose_pictures(job, capture)
-    capture = choose_frames(job, capture)
-    poses = find_camera_poses(job, capture)
-    posed = limited(poses.apply(capture), job.settings.capture.holdout, job.settings.views.limit)
-    job.corrections = corrections = find_effects(job, posed)
-    poses, posed = refined(poses, corrections), corrections.on_capture(posed)
-    scene = measure_scene(job, posed)
-    return capture, poses, posed, scene, make_views(job, posed, scene, corrections)
-
-
-def reconstruct_poses(job: Job) -> dict[str, Any]:
-    """Camera poses alone; answers a summary of them."""
-    capture = choose_frames(job, find_capture(job))
-    return summarise_poses(job, capture, find_camera_poses(job, capture))
-
-
-def reconstruct(job: Job, goals: frozenset[str] = ALL, go_on: bool = False) -> dict[str, Any]:
-    """Make the results named in `goals` (a part of `RESULTS`) and the report of all that is there; answers `report.json`.
-
-    With `go_on`, a field that the folder has is fitted further.
-
-    Results that are not asked for are left as they are, and stay in the report as long as they still fit.
+    Returns:
+        `report.json`.
     """
-    start = time.monotonic()
-    stages = job.stages
-    stages.trust(set(RESULTS) - goals)
-    stages.trust(() if "tsdf" in goals else (TSDF_TEXTURE,))
-    # What the networks left is what a fit begins with, whether the folder's field was fitted or not.
-    stages.trust(FOR_FIELD if "field" not in goals or (go_on and not job.other_network) else ())
-    capture, poses, posed, scene, views = stand(job)
-    if job.again and {"field", "export"} <= goals:
-        require_originals(job, posed, views)
-    choose_keyframes(job, scene, views)
+    wanted = frozenset(goals)
+    with open_job(place, options, progress, BEFORE if wanted else ("capture", "frames")) as job:
+        if not wanted:
+            capture = choose_frames(job, find_capture(job))
+            return summarise_poses(job, capture, find_camera_poses(job, capture))
+        plan = None if total_budget is None else TotalBudget(total_budget)
+        return reconstruct(job, wanted, Wish(formats, wanted == {"export"}), plan, go_on)
 
-    timeline: list[dict[str, Any]] = []
-    field, exported = None, None
-    pictures = {}
-    reuse_matched(job, scene, views)
-    if ("tsdf" in goals and wants_tsdf(job, posed)) or stages.usable("tsdf"):
-        pictures["tsdf"] = fuse_tsdf(job, posed, scene, views)
-        wanted = "tsdf" in goals and TEXTURE in job.settings.export.formats and pictures["tsdf"].facts["mesh"]["triangles"]
+
+def reconstruct(job: Job, goals: frozenset[str], wish: Wish, plan: TotalBudget | None, go_on: bool) -> dict[str, Any]:
+    """Make the results named in `goals` and the report of all that is there; answers `report.json`.
+
+    Results that are not among the goals are left as they are, and stay in the report as long as they still fit.
+    """
+    start, stages = time.monotonic(), job.stages
+    stages.trusted |= set(RESULTS) - goals
+    if "tsdf" not in goals:
+        stages.trusted.add(TSDF_TEXTURE)
+    if "field" not in goals or (go_on and "network" not in job.changed):
+        stages.trusted |= set(FOR_FIELD)  # what a fit begins with, whether the folder's field was fitted or not
+    capture = find_capture(job)
+    if plan is not None:
+        plan.choose_pictures(job, capture)
+    ready = prepare(job, capture)
+    if job.again and {"field", "export"} <= goals:
+        require_originals(job, ready)
+
+    results = Results(plan=plan)
+    if stages.usable("stereo"):
+        match_images(job, ready)  # so that a surface made of it counts as standing on what is there
+    if ("tsdf" in goals and wants_tsdf(job, ready)) or stages.usable("tsdf"):
+        results.pictures["tsdf"] = surface = fuse_tsdf(job, ready)
+        wanted = "tsdf" in goals and TEXTURE in job.settings.export.formats and surface.facts["mesh"]["triangles"]
         if wanted or stages.usable(TSDF_TEXTURE):
-            texture_tsdf(job, posed, scene, views)
+            texture_tsdf(job, ready)
     if goals & {"field", "render", "export"} or stages.usable("field"):
-        if uses_network(job, views):
-            made = make_network_field(job, views, scene)
+        network = None
+        if uses_network(job, ready, planned=plan is not None):
+            network = make_network_field(job, ready)
             if job.settings.fit.finetune:  # else the field is this one
-                pictures["network"] = render_network_views(job, made, views, scene)
-        if job.plan is not None:
-            job.plan.choose_fit(job, views, scene)
-        field, timeline = fit_radiance_field(job, views, scene, go_on)
+                results.pictures["network"] = render_network_views(job, ready, network)
+        if plan is not None:
+            plan.choose_fit(job, ready)
+        results.fitted = fitted = fit_radiance_field(job, ready, network, go_on)
         if "render" in goals or stages.usable("render"):
-            pictures["field"] = render_test_views(job, field, views, scene)
-        # Who has asked to stop waits for the report, not for a video.
+            results.pictures["field"] = render_test_views(job, ready, fitted.field)
+        # Who wants to stop waits for the report, not for a video.
         if stages.usable("export") or ("export" in goals and not stages.stopped()):
-            if job.plan is not None:
-                job.plan.choose_exports(job)
-            exported = export_results(job, field, poses, posed, scene, views)
-    scores = score_pictures(job, views, pictures)
-    return put_report(job, capture, poses, scene, views, field, timeline, pictures, scores, exported, time.monotonic() - start)
+            if plan is not None:
+                plan.choose_exports(job)
+            results.exported = export_results(job, ready, fitted, wish)
+    results.scores = score_pictures(job, ready, results.pictures)
+    return put_report(job, ready, results, time.monotonic() - start)
+
+
+def wants_tsdf(job: Job, ready: Prepared) -> bool:
+    """Whether this run makes the TSDF surface: when the capture has depth or the settings have it on; then images alone are matched."""
+    wanted = job.settings.tsdf.enabled
+    return wanted == "on" or (wanted == "auto" and ready.posed.has_depth)

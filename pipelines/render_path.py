@@ -7,7 +7,6 @@ import re
 import time
 from collections.abc import Iterator
 from contextlib import contextmanager, nullcontext
-from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -17,37 +16,26 @@ from fieldfuse.camera import Array, Intrinsics
 from fieldfuse.capture import nerf_json
 from fieldfuse.errors import InputError
 from fieldfuse.files import read_json, remove
-from fieldfuse.memory_limits import require_pictures
+from fieldfuse.memory import require_pictures
+from fieldfuse.pipelines.console import make_progress
+from fieldfuse.pipelines.fields import finished_field
 from fieldfuse.pipelines.job import open_job
 from fieldfuse.pipelines.pictures import camera_of, orbit_cameras, pictures
-from fieldfuse.pipelines.reconstruct import BEFORE, stand
+from fieldfuse.pipelines.prepare import BEFORE, prepare
 from fieldfuse.pipelines.rendered import file_name, write_png
-from fieldfuse.pipelines.steps_results import fit_radiance_field
-from fieldfuse.progress import Progress
 
 if TYPE_CHECKING:
     from fieldfuse.capture.types import Views
+    from fieldfuse.pipelines.options import Place
+    from fieldfuse.pipelines.render import CameraPath
 
 VIDEO = (".mp4",)
 NUMBERED = re.compile(r"\d{4,}_.*\.png")
 MAX_CAMERAS = 100_000
 
 
-@dataclass(frozen=True)
-class Shot:
-    """What is rendered: along `views` (an orbit of so many `frames`, or test) or by the `cameras` of a file, with this long side."""
-
-    views: str = "orbit"
-    cameras: Path | None = None
-    frames: int = 90
-    image_size: int | None = None
-    baked: bool = False
-    to: Path | None = None
-    fps: float = 30.0
-
-
-def render_run(target: Path, out: Path | None, options: dict[str, Any], shot: Shot, progress: Progress) -> dict[str, Any]:
-    """Render a shot; the field of a run's folder is taken as it is.
+def render_run(place: Place, path: CameraPath, options: dict[str, Any], baked: bool, quiet: bool) -> dict[str, Any]:
+    """Render along a path of cameras; the field of a run's folder is taken as it is.
 
     Returns:
         how many `pictures` of which `width` and `height`, the `seconds` it took, the path `to`, and how many `others` lie there besides.
@@ -56,44 +44,44 @@ def render_run(target: Path, out: Path | None, options: dict[str, Any], shot: Sh
         InputError: an unknown path of cameras, cameras that cannot be used, a folder without a field and without its source.
         OutputError: the result cannot be written.
     """
-    if shot.views not in ("orbit", "test"):
-        raise InputError(f"--views is {shot.views!r}; it must be orbit or test")
-    if shot.to is not None and shot.to.suffix and shot.to.suffix.lower() not in VIDEO:
-        raise InputError(f"--to {shot.to} must be an .mp4 file or a folder")
-    given = read_cameras(shot.cameras) if shot.cameras is not None else None
-    with open_job(target, out, options, progress, (*BEFORE, "field")) as job:
-        _, _, _, scene, views = stand(job)
-        field, _ = fit_radiance_field(job, views, scene)
+    if path.views not in ("orbit", "test"):
+        raise InputError(f"--views is {path.views!r}; it must be orbit or test")
+    if path.to is not None and path.to.suffix and path.to.suffix.lower() not in VIDEO:
+        raise InputError(f"--to {path.to} must be an .mp4 file or a folder")
+    given = read_cameras(path.cameras) if path.cameras is not None else None
+    with open_job(place, options, make_progress(quiet), (*BEFORE, "field")) as job:
+        ready = prepare(job)
+        scene, views, field = ready.scene, ready.views, finished_field(job, ready).field
         if given is not None:
             own, (names, lenses, poses) = "cameras", given
             poses = scene.working_from_input.poses(poses)
-        elif shot.views == "test":
+        elif path.views == "test":
             own, (names, lenses, poses) = "test", test_cameras(views)
         else:
-            own, (names, lenses, poses) = "orbit.mp4", orbit_cameras(views, scene, shot.frames)
-        lenses = [sized(lens, shot.image_size) for lens in lenses]
-        place = shot.to or job.folder / "renders" / own
+            own, (names, lenses, poses) = "orbit.mp4", orbit_cameras(views, scene, path.frames)
+        lenses = [sized(lens, path.image_size) for lens in lenses]
+        target = path.to or job.folder / "renders" / own
         require_pictures(lenses, kept=False)
         start = time.monotonic()
         job.progress.begin("render")
-        frames = pictures(camera_of(job, field, views, scene, shot.baked), lenses, poses, job.progress)
+        frames = pictures(camera_of(job, field, views, scene, baked), lenses, poses, job.progress)
         others = 0
-        if place.suffix.lower() in VIDEO:
+        if target.suffix.lower() in VIDEO:
             from fieldfuse.export.video import write_video
 
             if len({(lens.width, lens.height) for lens in lenses}) > 1:
                 raise InputError("a video needs pictures of one size and these cameras differ; give a folder with --to, or --image-size")
-            write_video(place, frames, shot.fps)
+            write_video(target, frames, path.fps)
         else:
             # The command's own folder: its pictures take the place of those that an earlier command left there, when all are rendered.
-            with _replacing(place) if shot.to is None else nullcontext(place) as folder:
+            with _replacing(target) if path.to is None else nullcontext(target) as folder:
                 stems = (f"{index:04d}_{file_name(Path(name).stem)}" for index, name in enumerate(names))
                 written = {write_png(folder / f"{stem}.png", frame).name for stem, frame in zip(stems, frames, strict=True)}
-            others = sum(path.name not in written for path in place.glob("*.png"))
+            others = sum(found.name not in written for found in target.glob("*.png"))
         seconds = time.monotonic() - start
         job.progress.finish("render", seconds, False)
     size = {"width": lenses[0].width, "height": lenses[0].height}
-    return {"pictures": len(names), **size, "seconds": round(seconds, 3), "to": str(place), "others": others}
+    return {"pictures": len(names), **size, "seconds": round(seconds, 3), "to": str(target), "others": others}
 
 
 @contextmanager

@@ -2,15 +2,15 @@
 
 from __future__ import annotations
 
-import time
 from pathlib import Path
 from typing import Annotated
 
 import typer
 
-from fieldfuse.pipelines.options import Json, Quiet, Seed
+from fieldfuse.pipelines.options import Options, show, takes
 
 
+@takes("seed quiet json")
 def simulate(
     scene: Annotated[
         str, typer.Argument(metavar="SCENE.yaml", help="A scene file, or the name of one that comes along (room, street, …).")
@@ -20,9 +20,8 @@ def simulate(
         str | None,
         typer.Option(help="name or name:strength, separated by commas, instead of the scene file's; none: no effects.", show_default=False),
     ] = None,
-    seed: Seed = None,
-    quiet: Quiet = False,
-    json: Json = False,
+    *,
+    options: Options,
 ) -> None:
     """Film a procedural or mesh scene into a capture with ground truth beside it."""
     from fieldfuse.pipelines.console import make_progress
@@ -31,23 +30,15 @@ def simulate(
 
     path = find_scene(scene)
     settings = read_scene_file(path)
-    if seed is not None:
-        settings.seed = seed
+    if options.seed is not None:
+        settings.seed = options.seed
     listing = None if effects is None else [name for name in effects.split(",") if name.strip() not in ("", "none")]
-    progress = make_progress(quiet or json)
-    began = time.monotonic()
-    with progress.listening():
-        progress.begin("film")
+    progress = make_progress(options.quiet or options.json)
+    with progress.listening(), progress.stage("film"):
         film = film_scene(settings, out, path.parent, listing, progress)
-        progress.finish("film", time.monotonic() - began, cached=False)
     names = list(film.effects.names())
-    if json:
-        import json as writer
-
-        facts = {"capture": str(out), "scene": settings.scene, "seed": settings.seed, "frames": len(film), "effects": names}
-        typer.echo(writer.dumps(facts, indent=1))
-    elif not quiet:
-        typer.echo(f"{out}: {len(film)} frames, effects: {', '.join(names) or 'none'}")
+    facts = {"capture": str(out), "scene": settings.scene, "seed": settings.seed, "frames": len(film), "effects": names}
+    show(facts, options, lambda: [f"{out}: {len(film)} frames, effects: {', '.join(names) or 'none'}"])
 
 
 def find_scene(name: str) -> Path:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import platform
 import time
-from dataclasses import replace
+from dataclasses import dataclass, field, replace
 from datetime import UTC, datetime
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -14,24 +14,24 @@ import numpy as np
 from fieldfuse import __version__
 from fieldfuse.config import settings_dict
 from fieldfuse.files import write_json
-from fieldfuse.pipelines.fit_files import fit_left_out, fit_matched, fit_notes
+from fieldfuse.pipelines.exports import put_cameras
+from fieldfuse.pipelines.fields import Fitted
 from fieldfuse.pipelines.folder import command_line
 from fieldfuse.pipelines.job import Job
+from fieldfuse.pipelines.prepare import EFFECTS_FILE, Prepared
 from fieldfuse.pipelines.rendered import Pictures, depth_step
-from fieldfuse.pipelines.steps_effects import effects_part, effects_warnings, moved_cameras, moved_depth
+from fieldfuse.pipelines.schemas import Effects, read_checked
+from fieldfuse.pipelines.source import picture_size
 from fieldfuse.pipelines.textured import TSDF_TEXTURE
+from fieldfuse.pipelines.total_budget import TotalBudget
 
 if TYPE_CHECKING:
     from fieldfuse.camera import Array
-    from fieldfuse.capture.types import Capture, Views
+    from fieldfuse.capture.types import Capture
     from fieldfuse.poses.result import PoseResult
-    from fieldfuse.poses.scene import Scene
-    from fieldfuse.render.field import Field
     from fieldfuse.stereo.transients import LeftOut
 
-SEEN_BY_SFM = (
-    "poses were estimated from all images, the held-out ones included, so scores are slightly optimistic"
-)
+SEEN_BY_SFM = "poses were estimated from all images, the held-out ones included, so scores are slightly optimistic"
 MATCHED = (
     "Matching {views} training images of {pixels} pixels with each other ({seconds:.1f} s of the fit's budget) gave depth for"
     " {percent:.0f}% of their pixels{bare}."
@@ -42,22 +42,14 @@ LEFT_OUT = (
     " than several other images agree on ({seconds:.1f} s of the fit's budget). Test views are scored on all their pixels."
 )
 NOTHING_LEFT_OUT = "Nothing that moves was found in the {looked_at} training images ({seconds:.1f} s of the fit's budget)."
+SEES = {
+    "none": "colours do not depend on the direction of view",
+    "low": "colours depend on the direction of view in first order",
+    "full": "colours depend on the direction of view",
+}
+POSES = ("source", "registered", "total", "models", "missing", "seconds", "agreement")
 OPENED = {".html", ".ply", ".obj", ".glb", ".mp4", ".txt", ".json"}
 NO_TEST_VIEWS = "no image was held out, so there are no scores; give --holdout 8 to keep every 8th image for testing"
-
-
-def picture_size(capture: Capture) -> tuple[int | None, int | None]:
-    """Width and height of the capture's first picture, as its header says."""
-    first = capture.frames[0]
-    if first.intrinsics is not None:
-        return first.intrinsics.width, first.intrinsics.height
-    if capture.kind == "video":
-        return capture.extra.get("width"), capture.extra.get("height")
-    from fieldfuse.capture.headers import read_bytes, read_header
-
-    header = read_header(read_bytes(first.image), first.image)
-    turned = header.orientation >= 5  # EXIF: the stored picture lies on its side
-    return (header.height, header.width) if turned else (header.width, header.height)
 
 
 def describe_capture(capture: Capture) -> dict[str, Any]:
@@ -76,19 +68,6 @@ def describe_capture(capture: Capture) -> dict[str, Any]:
     }
 
 
-def describe_poses(poses: PoseResult) -> dict[str, Any]:
-    """The report's part `poses`."""
-    return {
-        "source": poses.source,
-        "registered": poses.registered,
-        "total": poses.total,
-        "models": poses.models,
-        "missing": poses.missing,
-        "seconds": poses.seconds,
-        "agreement": poses.agreement,
-    }
-
-
 def base_data(job: Job, capture: Capture, poses: PoseResult) -> dict[str, Any]:
     return {
         "version": __version__,
@@ -96,7 +75,7 @@ def base_data(job: Job, capture: Capture, poses: PoseResult) -> dict[str, Any]:
         "created": datetime.now(UTC).isoformat(timespec="seconds"),
         "source": str(job.source),
         "capture": describe_capture(capture),
-        "poses": describe_poses(poses),
+        "poses": {name: getattr(poses, name) for name in POSES},
         "stages": job.stages.summary(),
         "settings": settings_dict(job.settings),
         "machine": {"python": platform.python_version(), "system": platform.platform(), "device": job.settings.device},
@@ -110,43 +89,17 @@ def summarise_poses(job: Job, capture: Capture, poses: PoseResult) -> dict[str, 
     return {**data, "warnings": unique([*capture.warnings, *poses.warnings]), "exports": [{"path": "exports/cameras/transforms.json"}]}
 
 
-def put_cameras(
-    folder: Path, poses: PoseResult, posed: Capture, points: Array | None = None, colours: Array | None = None
-) -> None:
-    """Cameras as transforms.json and COLMAP text, to be put into the capture's folder: for the pictures as they lie there.
-
-    Args:
-        points, colours: (P, 3) of a surface in the input's frame, for poses that came without points: programs that start from points
-            need some.
-    """
-    from fieldfuse.capture.convert import all_converted
-    from fieldfuse.capture.select import SELECTED
-    from fieldfuse.capture.stored import stored_cameras
-    from fieldfuse.export.cameras import write_cameras
-
-    made_here = SELECTED in posed.extra or all_converted(posed)  # then the pictures lie in the run's folder
-    root = posed.frames[0].image.parent.parent if made_here else posed.root
-    # A capture that is reached through a link has its images where the link leads.
-    bases = (root, root.resolve())
-    paths = [frame.image for frame in posed.frames]
-    files = [next((path.relative_to(base).as_posix() for base in bases if path.is_relative_to(base)), str(path)) for path in paths]
-    # Those of the frames that take part, which may be fewer than have a pose.
-    intrinsics, world_from_camera = stored_cameras(posed)
-    if poses.points is not None and len(poses.points):
-        points, colours = poses.points, None
-    write_cameras(folder, files, intrinsics, world_from_camera, points, colours)
-
-
 def unique(texts: list[str]) -> list[str]:
     return list(dict.fromkeys(texts))
 
 
-def warnings_of(job: Job, capture: Capture, poses: PoseResult, scene: Scene, views: Views) -> list[str]:
-    """Everything that a reader of the numbers has to know."""
-    moved = moved_cameras(job, capture) if poses.source == "given" else []
-    moved += moved_depth(job, capture)
-    texts = [*capture.warnings, *poses.warnings, *effects_warnings(job), *moved, *scene.warnings, *fit_notes(job)]
-    if not np.any(views.test):
+def warnings_of(job: Job, ready: Prepared, fitted: Fitted | None = None) -> list[str]:
+    """Everything that a reader of the numbers has to be aware of."""
+    poses = ready.poses
+    moved = [*(refined_cameras(ready) if poses.source == "given" else []), *depth_offset(ready)]
+    notes = [] if fitted is None else fitted.notes
+    texts = [*ready.capture.warnings, *poses.warnings, *effects_warnings(job), *moved, *ready.scene.warnings, *notes]
+    if not np.any(ready.views.test):
         texts.append(NO_TEST_VIEWS)
     elif poses.source == "sfm":
         texts.append(SEEN_BY_SFM)
@@ -167,69 +120,59 @@ def describe_matching(matched: dict[str, Any]) -> str:
 
 def describe_left_out(left_out: LeftOut) -> str:
     """A sentence about what moves."""
-    told = left_out.to_dict()
-    return (LEFT_OUT if left_out.masks else NOTHING_LEFT_OUT).format(**told, percent=100 * left_out.share)
+    return (LEFT_OUT if left_out.masks else NOTHING_LEFT_OUT).format(**left_out.to_dict(), percent=100 * left_out.share)
 
 
-def describe_field(
-    field: Field | None, matched: dict[str, Any] | None = None, left_out: LeftOut | None = None
-) -> dict[str, Any] | None:
-    """The report's part `field`; the voxel size is in working units. `matched` is what the fit's quick matching found, `left_out` what
-    it did without."""
-    if field is None:
-        return None
-    return {
-        "voxel_size": field.voxel_size,
-        "blocks": field.blocks,
-        "voxels": field.voxels,
-        "bytes": field.bytes,
-        "resolution": field.resolution,
-        **({"matched": matched} if matched is not None else {}),
-        **({"left_out": left_out.to_dict()} if left_out is not None else {}),
-    }
+def describe_field(fitted: Fitted) -> dict[str, Any]:
+    """The report's part `field`; the voxel size is in working units."""
+    found = {name: getattr(fitted.field, name) for name in ("voxel_size", "blocks", "voxels", "bytes", "resolution")}
+    if fitted.matched is not None:
+        found["matched"] = fitted.matched
+    if fitted.left_out is not None:
+        found["left_out"] = fitted.left_out.to_dict()
+    return found
 
 
 def exported_files(job: Job) -> list[dict[str, Any]]:
     """Files that other programs can open, as they stand in the records of the stages."""
-    out = []
-    for name in ("tsdf", TSDF_TEXTURE, "export"):
-        record = job.stages.records.get(name)
-        out += [{"path": path, "bytes": size} for path, size in (record.outputs if record else {}).items() if is_export(path)]
-    return out
+    records = [job.stages.records[name] for name in job.stages.done("tsdf", TSDF_TEXTURE, "export")]
+    return [
+        {"path": path, "bytes": size}
+        for record in records
+        for path, size in record.outputs.items()
+        if path.startswith(("exports/", "tsdf/", "mesh")) and Path(path).suffix in OPENED and not path.endswith("facts.json")
+    ]
 
 
-def is_export(path: str) -> bool:
-    """True for what other programs open."""
-    return path.startswith(("exports/", "tsdf/", "mesh")) and Path(path).suffix in OPENED and not path.endswith("facts.json")
+@dataclass
+class Results:
+    """What a run made: renders of the held-out views by method, the field, the facts of the exports, scores by method."""
+
+    plan: TotalBudget | None = None
+    pictures: dict[str, Pictures] = field(default_factory=dict)
+    fitted: Fitted | None = None
+    exported: dict[str, Any] | None = None
+    scores: dict[str, Any] = field(default_factory=dict)
 
 
-def put_report(
-    job: Job,
-    capture: Capture,
-    poses: PoseResult,
-    scene: Scene,
-    views: Views,
-    field: Field | None,
-    timeline: list[dict[str, Any]],
-    pictures: dict[str, Pictures],
-    scores: dict[str, Any],
-    export_facts: dict[str, Any] | None,
-    seconds: float,
-) -> dict[str, Any]:
+def put_report(job: Job, ready: Prepared, results: Results, seconds: float) -> dict[str, Any]:
     """Write report.json and report.html; `seconds` is what this command took so far, reused stages count as they took."""
     from fieldfuse.evaluation.failure import failures
     from fieldfuse.evaluation.pictures import method_pictures, moving_pictures
     from fieldfuse.evaluation.report import report_data, write_report
 
-    notes = export_facts["notes"] if export_facts else []
-    began, told = time.monotonic(), None if job.plan is None else job.plan.told(job)
-    matched = None if field is None else fit_matched(job)
-    left_out = None if field is None else fit_left_out(job)
+    began, plan, scene, views = time.monotonic(), results.plan, ready.scene, ready.views
+    budget = None if plan is None else plan.report(job)
+    fitted, exported, scores = results.fitted, results.exported, results.scores
+    left_out = None if fitted is None else fitted.left_out
+    notes = [] if fitted is None or fitted.matched is None else [describe_matching(fitted.matched)]
+    if left_out is not None:
+        notes.append(describe_left_out(left_out))
     data = {
-        **base_data(job, capture, poses),
-        "warnings": warnings_of(job, capture, poses, scene, views) + notes,
+        **base_data(job, ready.capture, ready.poses),
+        "warnings": warnings_of(job, ready, fitted) + (exported["notes"] if exported else []),
         "scene": scene.to_dict(),
-        "effects": effects_part(job, None if field is None else field.space.shell > 0),
+        "effects": effects_part(job, None if fitted is None else fitted.field.space.shell > 0),
         "views": {
             "total": len(views),
             "test": int(np.sum(views.test)),
@@ -237,26 +180,95 @@ def put_report(
             "height": views.intrinsics[0].height,
             "depth_step": depth_step(scene),
         },
-        "field": describe_field(field, matched, left_out),
-        "notes": [
-            *([] if matched is None else [describe_matching(matched)]),
-            *([] if left_out is None else [describe_left_out(left_out)]),
-        ],
+        "field": None if fitted is None else describe_field(fitted),
+        "notes": notes,
         "evaluation": {name: scores.get(name) for name in ("field", "tsdf", *(["network"] if "network" in scores else []))},
         "baseline": scores.get("nearest_image"),
-        "timeline": timeline,
+        "timeline": [] if fitted is None else fitted.timeline,
         "exports": exported_files(job),
-        "export_facts": export_facts,
-        "seconds_total": round(seconds + job.stages.fresh_seconds(), 3),
+        "export_facts": exported,
+        "seconds_total": round(seconds + job.stages.reused_seconds(), 3),
     }
     data["warnings"] = unique([*failures(report_data(data)), *data["warnings"]])
-    if job.plan is not None and told is not None:
-        data |= {"budget": told, "notes": [job.plan.note(told), *data["notes"]]}
-    shown = {name: [*found.pictures] for name, found in pictures.items()}
+    if plan is not None and budget is not None:
+        data |= {"budget": budget, "notes": [plan.note(budget), *notes]}
+    shown = {name: [*found.pictures] for name, found in results.pictures.items()}
     unit = "m" if scene.metric else "units"
     tiles = replace(method_pictures(views, np.flatnonzero(views.test), shown, unit), moving=moving_pictures(views, left_out))
     write_report(job.folder.path, data, tiles)
-    if job.plan is not None:
-        data["budget"] = job.plan.finish(job, time.monotonic() - began)
+    if plan is not None:
+        data["budget"] = plan.finish(job, time.monotonic() - began)
         write_json(job.folder / "report.json", report_data(data, job.folder.path))
     return report_data(data, job.folder.path)
+
+
+def effects_part(job: Job, background: bool | None) -> dict[str, Any] | None:
+    """The report's part `effects`: decisions without the corrections' many numbers; None when nothing was looked for."""
+    if "effects" not in job.stages.records:
+        return None
+    data = read_checked(job.folder / EFFECTS_FILE, Effects)
+    effects, view = data["effects"], job.settings.field.view
+    for entry in effects:
+        if entry["effect"] == "view_dependence" and view != "auto":
+            entry["on"] = view != "none"
+            entry["note"] = f"{SEES[view]}: field.view={view}"
+        if entry["effect"] == "background" and background is not None:
+            entry["on"] = background
+            entry["note"] = "space beyond the region of interest is modelled" if background else "nothing beyond the region is modelled"
+    dimmed = (data.get("corrections") or {}).get("dimmed", 1.0)
+    return {"effects": effects, "seconds": data["seconds"], "looked_at": data["looked_at"], "dimmed": dimmed}
+
+
+def refined_cameras(ready: Prepared) -> list[str]:
+    """How far poses that came with the capture were refined by what images and depth show: what is exported lies with the refined ones."""
+    corrections, capture = ready.corrections, ready.capture
+    given = {frame.name: frame.world_from_camera for frame in capture.frames if frame.world_from_camera is not None}
+    names = [name for name in corrections.poses if name in given]
+    if not names:
+        return []
+    length, turn = _apart(capture, np.stack([given[name] for name in names]), np.stack([corrections.poses[name] for name in names]))
+    if length[:4] in ("0.0 ", "0 of") and turn == "0.00°":
+        return []
+    unregistered = capture.has_depth and corrections.depth is None and not corrections.by_depth
+    depth = "; a sensor's depth that is not registered with the colours fits those better" if unregistered else ""
+    return [
+        f"the poses that came with the capture were refined by its pictures{' and depth' if corrections.by_depth else ''}: cameras moved by"
+        f" {length} and turned by {turn} in the median, and surfaces lie with them; --set effects.off=[poses] keeps the poses as they came"
+        f"{depth}"
+    ]
+
+
+def depth_offset(ready: Prepared) -> list[str]:
+    """How far the depth camera stands from the images', where depth is reprojected from the one to the other."""
+    if ready.corrections.depth is None:
+        return []
+    length, turn = _apart(ready.capture, np.eye(4)[None], ready.corrections.depth[None])
+    return [
+        f"the depth camera was found to stand {length} beside the pictures' and to be turned by {turn}, and its depth is carried over;"
+        " --set effects.off=[depth_offset] uses depth as it came"
+    ]
+
+
+def _apart(capture: Capture, some: Array, others: Array) -> tuple[str, str]:
+    """How far poses (N, 4, 4) lie from others in the median, and how far they are turned, in words."""
+    from fieldfuse.effects.correct import apart
+
+    way, turn = apart(some, others)
+    length = f"{100 * np.median(way):.1f} cm" if capture.metric else f"{np.median(way):.3g} of the capture's units"
+    return length, f"{np.median(turn):.2f}°"
+
+
+def effects_warnings(job: Job) -> list[str]:
+    """What a user has to know: effects that are there and cannot be corrected."""
+    part = effects_part(job, None)
+    if part is None:
+        return []
+    shown = {
+        "rolling_shutter": "the pictures' rows were read one after the other while the camera moved",
+        "motion_blur": "some pictures are blurred",
+    }
+    return [
+        f"{shown[entry['effect']]}: {entry['reason']}"
+        for entry in part["effects"]
+        if entry["there"] and not entry["on"] and entry["effect"] in shown and entry["wish"] != "off"
+    ]

@@ -8,12 +8,12 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from fieldfuse.export.surface import Originals
+from fieldfuse.pipelines.stages import Stage
 from fieldfuse.tone import exposed
 
 if TYPE_CHECKING:
-    from fieldfuse.capture.types import Capture, Views
     from fieldfuse.pipelines.job import Job
-    from fieldfuse.poses.scene import Scene
+    from fieldfuse.pipelines.prepare import Prepared
     from fieldfuse.tsdf.mesh import Mesh
 
 TSDF_TEXTURE = "tsdf_texture"  # the stage
@@ -22,21 +22,21 @@ TRIANGLES = 80_000  # detail is in the texture
 TEXEL_BYTES = 40  # while a texture is made and packed
 
 
-def texture_tsdf(job: Job, posed: Capture, scene: Scene, views: Views) -> None:
+def texture_tsdf(job: Job, ready: Prepared) -> None:
     """`tsdf/textured.glb`, a stage of its own: what the TSDF's seconds are compared with has no texture in it."""
     path = job.folder / "tsdf" / TEXTURED
 
     def make() -> Path:
         from fieldfuse.evaluation.geometry import read_mesh
 
-        mesh = read_mesh(path.with_name("mesh.ply")).transformed(scene.working_from_input)
-        return put_textured(job, path, mesh.with_normals(), posed, scene, views)
+        mesh = read_mesh(path.with_name("mesh.ply")).transformed(ready.scene.working_from_input)
+        return put_textured(job, ready, path, mesh.with_normals())
 
     settings = [job.settings.export.texture_size, TRIANGLES]
-    job.stages.run(TSDF_TEXTURE, make=make, save=lambda made: [made], load=lambda: path, uses=settings, after=["tsdf", "views"], version=2)
+    job.run(Stage(TSDF_TEXTURE, make, lambda made: [made], lambda: path, ["tsdf", "views"], settings, version=2))
 
 
-def put_textured(job: Job, path: Path, mesh: Mesh, posed: Capture, scene: Scene, views: Views) -> Path:
+def put_textured(job: Job, ready: Prepared, path: Path, mesh: Mesh) -> Path:
     """A coarser mesh (working frame, with normals) with a texture of the training pictures, in the input's frame."""
     from fieldfuse import memory
     from fieldfuse.export.mesh import write_textured
@@ -46,10 +46,9 @@ def put_textured(job: Job, path: Path, mesh: Mesh, posed: Capture, scene: Scene,
     while largest > 1024 and TEXEL_BYTES * largest**2 > memory.bounded(TEXEL_BYTES * LARGEST**2):
         largest //= 2
     thin = mesh.decimated(TRIANGLES)
-    train = np.flatnonzero(~views.test)
-    shown = views.subset(train)
-    lenses, images = Originals(posed, job.corrections).at(train, shown, job.settings.export.texture_size)
+    train, shown = np.flatnonzero(~ready.views.test), ready.training
+    lenses, images = Originals(ready.posed, ready.corrections).at(train, shown, job.settings.export.texture_size)
     photos = Photos(images, lenses, shown.world_from_camera, shown.valid, shown.weight)
     atlas, texture = textured(thin, photos, largest, job.progress)
-    write_textured(path, thin, atlas, exposed(texture, views.exposure), scene.working_from_input)
+    write_textured(path, thin, atlas, exposed(texture, ready.views.exposure), ready.scene.working_from_input)
     return path

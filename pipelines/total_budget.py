@@ -17,15 +17,16 @@ from fieldfuse.config import EXPORTS, settings_dict
 from fieldfuse.errors import FieldfuseError
 from fieldfuse.evaluation import budget as model
 from fieldfuse.files import fingerprint, read_json, write_json
+from fieldfuse.pipelines.exports import TEXTURE
 from fieldfuse.pipelines.pictures import PAGE
-from fieldfuse.pipelines.taken import TEXTURE
+from fieldfuse.pipelines.source import picture_size
 from fieldfuse.pipelines.textured import TSDF_TEXTURE
 
 if TYPE_CHECKING:
-    from fieldfuse.capture.types import Capture, Views
+    from fieldfuse.capture.types import Capture
     from fieldfuse.config import Settings
     from fieldfuse.pipelines.job import Job
-    from fieldfuse.poses.scene import Scene
+    from fieldfuse.pipelines.prepare import Prepared
 
 FILE = "plan.json"
 LONGEST_START = 60.0  # seconds; a process that is older was not started for this command
@@ -36,22 +37,26 @@ WORTH_LEARNING = 0.3  # seconds; shorter stages say little
 
 
 class TotalBudget:
-    """The plan of one run: what was asked for, what was chosen, what was predicted."""
+    """The plan of one run: the target, what was chosen, what was predicted.
+
+    Attributes:
+        speed: of this machine. work: of the capture. choice: what was decided so far; all three from `choose_pictures` on.
+        predicted: stage → seconds. self_test: seconds that the machine's self-test took, once; most of them are compiling.
+        all_wanted: exports are what they are by default. again: an earlier run of the same plan has decided everything.
+    """
+
+    speed: model.Speed
+    work: model.Work
+    choice: model.Choice
 
     def __init__(self, seconds: float) -> None:
         self.asked = seconds
         started = time.time() - psutil.Process().create_time()
         self._began = time.monotonic() - (started if started < LONGEST_START else 0.0)
-        self.speed: model.Speed | None = None
-        self.work: model.Work | None = None
-        self.choice: model.Choice | None = None
         self.predicted: dict[str, float] = {}
-        self.self_test = 0.0  # seconds that the machine's self-test took, once, besides what was asked for: most of them are compiling
-        self.export_planned = 0.0  # seconds, when it was decided how much is exported
-        self.all_wanted = False  # nobody said what is to be exported
-        self.again = False  # an earlier run of the same plan has decided everything
-        self.name = ""
-        self.given = ""  # hash of what else the plan depends on: settings, machine, capture
+        self.self_test = self.export_planned = 0.0
+        self.all_wanted = self.again = False
+        self.name = self.given = ""  # of the machine, and a hash of what else the plan depends on: settings, machine, capture
 
     def elapsed(self) -> float:
         return time.monotonic() - self._began
@@ -63,15 +68,15 @@ class TotalBudget:
         settings = job.settings
         threads = settings.threads or psutil.cpu_count() or 1
         self.name = model.signature(threads, settings.device)
-        self.speed = model.remembered(self.name)
-        if self.speed is None:
-            job.progress.begin("self-test")
+        speed = model.remembered(self.name)
+        if speed is None:
             start = time.monotonic()
-            self.speed = self_test(settings)
+            with job.progress.stage("self-test"):
+                speed = self_test(settings)
             self.self_test = time.monotonic() - start
-            job.progress.finish("self-test", self.self_test, False)
             self._began += self.self_test
-            model.remember(self.name, self.speed)
+            model.remember(self.name, speed)
+        self.speed = speed
         self.work = work_of(capture, settings)
         self.given = fingerprint(settings_dict(settings), self.name, asdict(self.work))
         self.all_wanted = list(settings.export.formats) == list(EXPORTS)
@@ -97,7 +102,6 @@ class TotalBudget:
 
     def _decide_effects(self, settings: Settings, kept: model.Choice | None) -> None:
         """Looking for them is left out, unless some are asked for by name, when it would take most of so short a run."""
-        assert self.speed is not None and self.work is not None
         if not self.work.effects or settings.effects.on:
             return
         looking = self.speed.seconds("effects", model.effects_work(self.work))
@@ -114,7 +118,6 @@ class TotalBudget:
     def _left_out_early(self, extra: str, kept: model.Choice | None) -> bool:
         """Whether it is already known now that this is left out: an earlier run decided so, or the TSDF, which is made before the field,
         would take too long for its texture. Everything else is decided when the fit is."""
-        assert self.speed is not None and self.work is not None
         if kept is not None:
             return getattr(kept, extra) is False
         early = extra == TEXTURE and self.work.depth
@@ -122,22 +125,18 @@ class TotalBudget:
 
     def _leave_out(self, settings: Settings, extra: str) -> None:
         """Exports are made without it."""
-        assert self.work is not None
         settings.export.formats = [name for name in settings.export.formats if name != extra]
         self.work = replace(self.work, **{extra: False})
 
     def _left(self, job: Job) -> float:
         """Seconds that are left for the fit, with all exports that are still wanted after it."""
-        assert self.speed is not None
-        after = sum(self.predicted.get(stage, 0.0) for stage in ("render", "evaluate", "report")) * self._pace(job)
-        left = self.asked - self.elapsed() - after
+        left = self._before(job, "render", "evaluate", "report")
         return left - self._for_exports(job, left) - self.speed.seconds("beside", 1.0)
 
-    def choose_fit(self, job: Job, views: Views, scene: Scene) -> None:
+    def choose_fit(self, job: Job, ready: Prepared) -> None:
         """Decide the fit's seconds and its finest lattice from what is left, and whether meshes get textures and the field its page."""
         from fieldfuse.training.start import worth_a_level
 
-        assert self.speed is not None and self.work is not None and self.choice is not None
         if not self.again:
             for extra in (TEXTURE, PAGE) if self.all_wanted else ():
                 if getattr(self.work, extra) and self._left(job) < self._least_fit:
@@ -145,7 +144,7 @@ class TotalBudget:
             self.choice.texture, self.choice.page = self.work.texture, self.work.page
             self.choice.fit_seconds = round(max(model.LEAST_FIT, self._left(job)), 2)
             pace = self.speed.units["fit"] * self._pace(job)
-            possible = model.resolution_for(self.choice.fit_seconds, pace, finest(job, views, scene))
+            possible = model.resolution_for(self.choice.fit_seconds, pace, finest(job, ready))
             self.choice.resolution = possible if job.settings.field.resolution is not None else worth_a_level(possible)
         job.settings.fit.budget = self.choice.fit_seconds
         job.settings.fit.passes = None  # so many seconds were asked for
@@ -153,16 +152,14 @@ class TotalBudget:
 
     def choose_exports(self, job: Job) -> None:
         """Decide how much is rendered for mesh and video, at the pace that the test views were rendered at."""
-        assert self.work is not None and self.choice is not None and self.speed is not None
         export = job.settings.export
         if not self.again:
             rays = model.amounts(self.work, self.choice)["render"]
             spent = job.stages.records["render"].seconds
-            after = sum(self.predicted.get(stage, 0.0) for stage in ("evaluate", "report")) * self._pace(job)
             factor = self.speed.factors.get("export", 1.0)
-            a_ray = factor * model.EXPORT_RAY * (spent / rays if rays else self._predicted_ray())
+            a_ray = factor * model.EXPORT_RAY * (spent / rays if rays else self.speed.seconds("export", 1.0))
             a_frame = a_ray * model.video_rays(self.work, replace(self.choice, video_frames=1))
-            left = self.asked - self.elapsed() - after
+            left = self._before(job, "evaluate", "report")
             for size in (export.mesh_size, None):  # finer depth where that costs no view
                 self.choice.mesh_size = size
                 once, each = (factor * amount * self.speed.units["features"] for amount in model.mesh_work(self.work, self.choice))
@@ -180,9 +177,8 @@ class TotalBudget:
         else:
             export.formats = [name for name in export.formats if name != "video"]
 
-    def told(self, job: Job) -> dict[str, Any]:
+    def report(self, job: Job) -> dict[str, Any]:
         """The report's part `budget`: seconds asked for, predicted and real, in all and by stage, and what was chosen."""
-        assert self.choice is not None
         real = {record.name: record.seconds for record in job.stages.records.values()}
         names = {**dict.fromkeys(self.predicted), **dict.fromkeys(name for name in real if name not in ("field", "keyframes"))}
         shown = {
@@ -202,7 +198,6 @@ class TotalBudget:
     def note(self, told: dict[str, Any]) -> str:
         """One sentence for the page."""
         chosen = self.choice
-        assert chosen is not None
         parts = [f"pictures of {chosen.image_size} pixels", f"{chosen.fit_seconds:g} s of fitting", f"at most {chosen.resolution}³ voxels"]
         if chosen.max_frames is not None:
             parts.append(f"{chosen.max_frames} frames")
@@ -220,15 +215,15 @@ class TotalBudget:
 
     def finish(self, job: Job, report_seconds: float) -> dict[str, Any]:
         """After the report: correct its total, and learn from stages that took other than predicted."""
-        told = self.told(job)
+        told = self.report(job)
         told["stages"]["report"] = {"predicted": _round(self.predicted.get("report")), "real": _round(report_seconds)}
-        if self.speed is not None and not told["reused"]:
+        if not told["reused"]:
             for name in NOT_FITTED:
                 real, predicted = told["stages"].get(name, {}).get("real"), self.predicted.get(name)
                 if real and predicted and max(real, predicted) > WORTH_LEARNING and name not in ("export", "effects"):
                     self.speed.learn(name, predicted, real)
             fitted = told["stages"].get("fit", {}).get("real")
-            if fitted and self.choice is not None and self.choice.fit_seconds:
+            if fitted and self.choice.fit_seconds:
                 beside = self.speed.seconds("beside", 1.0)
                 self.speed.learn("beside", beside, max(fitted - self.choice.fit_seconds, 0.2 * beside))
             self._learn_effects(job, told["stages"].get("effects", {}).get("real"))
@@ -244,7 +239,6 @@ class TotalBudget:
     def _for_exports(self, job: Job, left: float) -> float:
         """Seconds that are set aside for exports: a share of what is left, no more than all of them can take, no less
         than the fewest."""
-        assert self.speed is not None and self.work is not None and self.choice is not None
         export = job.settings.export
         video = export.video_frames if "video" in export.formats else 0
         finest = replace(self.choice, mesh_size=export.mesh_size)
@@ -256,7 +250,6 @@ class TotalBudget:
     def _learn_effects(self, job: Job, real: float | None) -> None:
         """Looking for effects takes less when none is corrected: what is learnt is what a picture takes. Where all were looked at, and none
         was corrected after all, only the seconds tell."""
-        assert self.speed is not None and self.work is not None
         path = job.folder / "effects.json"
         if not real or real < WORTH_LEARNING or not path.is_file():
             return
@@ -265,6 +258,10 @@ class TotalBudget:
         corrected = bool(made.get("gain") or made.get("poses"))
         self.speed.learn("effects", all_of_them if corrected else min(max(real, some), all_of_them), real)
 
+    def _before(self, job: Job, *later: str) -> float:
+        """Seconds that are left before these stages must begin."""
+        return self.asked - self.elapsed() - sum(self.predicted.get(stage, 0.0) for stage in later) * self._pace(job)
+
     def _pace(self, job: Job) -> float:
         """How much slower than predicted the stages were so far; other work on the machine slows the rest, too."""
         done = [name for name in ("capture", "scene", "views") if name in self.predicted and not job.stages.cached.get(name, True)]
@@ -272,12 +269,7 @@ class TotalBudget:
         predicted = sum(self.predicted[name] for name in done)
         return min(max((real + model.STEADY) / (predicted + model.STEADY), 0.5), 3.0)
 
-    def _predicted_ray(self) -> float:
-        assert self.speed is not None
-        return self.speed.seconds("export", 1.0)
-
     def _keep(self, job: Job) -> None:
-        assert self.choice is not None
         kept = {"asked": self.asked, "source": str(job.source), "given": self.given, "choice": self.choice.to_dict()}
         write_json(job.folder / FILE, kept)
 
@@ -303,7 +295,6 @@ def work_of(capture: Capture, settings: Any) -> model.Work:
     """What the capture asks for, from what its headers say."""
     from fieldfuse.capture.convert import to_convert
     from fieldfuse.capture.prepare import held_out
-    from fieldfuse.pipelines.summary import picture_size
 
     width, height = picture_size(capture)
     video = capture.filmed
@@ -336,15 +327,13 @@ def work_of(capture: Capture, settings: Any) -> model.Work:
     )
 
 
-def finest(job: Job, views: Views, scene: Scene) -> int:
+def finest(job: Job, ready: Prepared) -> int:
     """The lattice that a fit would end at without a budget."""
-    import numpy as np
-
     from fieldfuse.training.start import MARGIN, ROOM_MARGIN, finest_resolution, make_space
 
-    settings = job.settings.field
+    settings, scene, views = job.settings.field, ready.scene, ready.views
     if settings.resolution is not None:
         return settings.resolution
     background = scene.has_background if settings.background == "auto" else settings.background == "on"
     space = make_space(scene, background and views.background is None, MARGIN if views.background is not None else ROOM_MARGIN)
-    return finest_resolution(space, views.subset(np.flatnonzero(~views.test)), scene)
+    return finest_resolution(space, ready.training, scene)

@@ -2,29 +2,13 @@
 
 from __future__ import annotations
 
-import json as writer
-import sys
-from typing import Annotated
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Annotated, Any
 
 import typer
 
-from fieldfuse.pipelines.options import (
-    Config,
-    Decoder,
-    Device,
-    Holdout,
-    ImageSize,
-    Json,
-    OptionalOut,
-    Pairs,
-    PosesFrom,
-    Preset,
-    Quiet,
-    Seed,
-    Target,
-    Threads,
-    gather,
-)
+from fieldfuse.pipelines.options import Options, Place, bound_threads, show, takes
 
 Axes = Annotated[
     str | None,
@@ -43,48 +27,31 @@ SweepBudget = Annotated[
 ]
 
 
+@takes("preset image_size holdout device threads seed decoder poses config pairs quiet json")
 def tradeoff(
-    target: Target,
-    out: OptionalOut = None,
-    axes: Axes = None,
-    times: Times = None,
-    seeds: Seeds = 1,
-    budget: SweepBudget = None,
-    preset: Preset = None,
-    image_size: ImageSize = None,
-    holdout: Holdout = None,
-    device: Device = None,
-    threads: Threads = None,
-    seed: Seed = None,
-    decoder: Decoder = None,
-    poses: PosesFrom = None,
-    config: Config = None,
-    pairs: Pairs = None,
-    quiet: Quiet = False,
-    json: Json = False,
+    place: Place, axes: Axes = None, times: Times = None, seeds: Seeds = 1, budget: SweepBudget = None, *, options: Options
 ) -> None:
     """Make fields and surfaces with one setting changed at a time, measure each, and show quality against time and memory.
 
     Each point is kept as soon as it is measured: run the same command again after an interruption and it goes on.
     """
-    from fieldfuse.pipelines.thread_limits import bound_threads
-
-    flags = {"image_size": image_size, "holdout": holdout, "device": device, "threads": threads, "seed": seed, "decoder": decoder}
-    options = gather(preset, config, pairs, **flags, **{"poses.source": poses})
-    bound_threads(options)
-    from fieldfuse.evaluation.tradeoff import COSTS, front_sentence, points_of, sentence, steps
+    settings = options.settings()
+    bound_threads(settings)
     from fieldfuse.pipelines.console import make_progress
     from fieldfuse.pipelines.tradeoff_sweep import Choice, tradeoff_run
 
-    data = tradeoff_run(target, out, options, Choice(axes, times, seeds, budget), make_progress(quiet))
-    if json:
-        sys.stdout.write(writer.dumps(data, indent=1) + "\n")
-    elif not quiet:
-        points, unit = points_of(data["rows"]), data["unit"] or "units"
-        lines = [sentence(step, unit) for step in steps(points)]
-        lines += [text for cost in COSTS if (text := front_sentence(points, cost, unit)) is not None]
-        lines += [f"note: {row['id']}: {row['error']}" for row in data["rows"] if row["error"] is not None]
-        lines += [f"note: not measured yet: {name}" for name in data["left_out"]]
-        lines += [f"note: {warning}" for warning in data["warnings"]]
-        lines.append(str((out or target) / "tradeoff.html"))
-        sys.stdout.write("".join(f"{line}\n" for line in lines))
+    data = tradeoff_run(place, settings, Choice(axes, times, seeds, budget), make_progress(options.quiet))
+    show(data, options, lambda: lines(data, place.folder))
+
+
+def lines(data: dict[str, Any], folder: Path) -> Iterator[str]:
+    """Sentences on what was measured, remarks, and where the page is."""
+    from fieldfuse.evaluation.tradeoff import COSTS, front_sentence, points_of, sentence, steps
+
+    points, unit = points_of(data["rows"]), data["unit"] or "units"
+    yield from (sentence(step, unit) for step in steps(points))
+    yield from (text for cost in COSTS if (text := front_sentence(points, cost, unit)) is not None)
+    yield from (f"note: {row['id']}: {row['error']}" for row in data["rows"] if row["error"] is not None)
+    yield from (f"note: not measured yet: {name}" for name in data["left_out"])
+    yield from (f"note: {warning}" for warning in data["warnings"])
+    yield str(folder / "tradeoff.html")

@@ -22,8 +22,8 @@ from fieldfuse.camera import Array, Intrinsics
 from fieldfuse.config import Settings, TsdfSettings
 from fieldfuse.errors import FieldfuseError, InputError
 from fieldfuse.files import read_json, write_json
-from fieldfuse.pipelines.memory import PeakMemory, own_bytes
 from fieldfuse.pipelines.rendered import Picture, to_picture
+from fieldfuse.pipelines.stages import PeakMemory, own_bytes
 
 if TYPE_CHECKING:
     from fieldfuse.capture.types import Capture, Views
@@ -125,8 +125,9 @@ def open_ground(folder: Path, settings: Settings, share: float) -> Ground:
 def make_field(ground: Ground, spec: dict[str, Any], scratch: Path) -> list[Made]:
     """Fit a field, then show it as it is kept (16-bit features) and in each of the variants."""
     from fieldfuse.render.field import Field
+    from fieldfuse.training.fit import Begin
     from fieldfuse.training.guided import fit_guided
-    from fieldfuse.volume.grid_host import host_for
+    from fieldfuse.volume.grid import host_for
 
     settings, wanted = ground.settings, spec["wanted"]
     settings.fit = replace(settings.fit, budget=float(wanted["iterations"]), patience=False)
@@ -135,7 +136,7 @@ def make_field(ground: Ground, spec: dict[str, Any], scratch: Path) -> list[Made
     settings.field = replace(settings.field, decoder=wanted["decoder"], resolution=resolution)
     path = scratch / "field.safetensors"
     with Cost(ground) as cost:
-        result = fit_guided(ground.chosen, ground.scene, settings, host=host_for(settings.device))
+        result = fit_guided(ground.chosen, ground.scene, settings, begin=Begin(host_for(settings.device)))
         cost.lap("fit")
         result.field.save(path, ground.scene.working_from_input)
         cost.lap("save")

@@ -17,12 +17,13 @@ from fieldfuse.config import Settings, settings_dict
 from fieldfuse.errors import InputError
 from fieldfuse.evaluation.tradeoff import AXES
 from fieldfuse.files import fingerprint, read_json, remove, write_json
+from fieldfuse.pipelines.console import ConsoleProgress
 from fieldfuse.pipelines.direct_field import weights_state
 from fieldfuse.pipelines.job import Job, open_job
-from fieldfuse.pipelines.kept import MEASURED_POINT, read_kept
-from fieldfuse.pipelines.reconstruct import BEFORE, stand
+from fieldfuse.pipelines.options import Place
+from fieldfuse.pipelines.prepare import BEFORE, prepare
+from fieldfuse.pipelines.schemas import MeasuredPoint, read_checked
 from fieldfuse.poses.child import log_tail, run_logged
-from fieldfuse.progress import Progress
 
 VERSION = 1  # raised when what a point measures changes
 FIRST_GUESS = 15.0  # seconds that a point takes beside its fitting time, before one was measured
@@ -185,7 +186,7 @@ def axes_here(settings: Settings) -> tuple[list[str], dict[str, str]]:
 # ------------------------------------------------------------------------------------------------- the sweep
 
 
-def tradeoff_run(target: Path, out: Path | None, options: dict[str, Any], choice: Choice, progress: Progress) -> dict[str, Any]:
+def tradeoff_run(place: Place, options: dict[str, Any], choice: Choice, progress: ConsoleProgress) -> dict[str, Any]:
     """Measure what is missing and write `tradeoff.csv`, `tradeoff.html` and the plots; answers `tradeoff.json`.
 
     Raises:
@@ -194,21 +195,22 @@ def tradeoff_run(target: Path, out: Path | None, options: dict[str, Any], choice
     """
     from fieldfuse.evaluation.machine import machine
     from fieldfuse.evaluation.tradeoff_page import write_tradeoff
-    from fieldfuse.pipelines.steps_stereo import match_pictures
     from fieldfuse.pipelines.summary import base_data, warnings_of
+    from fieldfuse.pipelines.surfaces import match_images
 
     ladder = chosen_times(choice.times)
-    with open_job(target, out, options, progress, (*BEFORE, "stereo")) as job:
+    with open_job(place, options, progress, (*BEFORE, "stereo")) as job:
         can_vary, why_not = axes_here(job.settings)
         axes = chosen_axes(choice.axes, can_vary, why_not)
-        capture, poses, posed, scene, views = stand(job)
+        ready = prepare(job)
+        scene, views = ready.scene, ready.views
         if not views.test.any():
             raise InputError("what accuracy costs is measured on images kept for testing, and there is none; give --holdout 8")
-        surface: str | None = "tsdf" if posed.has_depth else "tsdf_stereo"
+        surface: str | None = "tsdf" if ready.posed.has_depth else "tsdf_stereo"
         refused = [f"The axis {name} was not varied: {why}." for name, why in why_not.items()]
         if surface == "tsdf_stereo":
             try:
-                match_pictures(job, scene, views)
+                match_images(job, ready)
             except InputError as error:  # a camera that only moves forward leaves nothing to match; the field can still be measured
                 surface = None
                 refused.append(f"No surface was made: {error}.")
@@ -218,11 +220,11 @@ def tradeoff_run(target: Path, out: Path | None, options: dict[str, Any], choice
                 rows += found
         finally:  # what was measured is shown, however the sweep ends
             done = {(row["id"], row["seed"]) for row in rows}
-            base, lens = base_data(job, capture, poses), views.intrinsics[0]
+            base, lens = base_data(job, ready.capture, ready.poses), views.intrinsics[0]
             data = {
                 **base,
                 "command": unbounded(base["command"]),
-                "warnings": warnings_of(job, capture, poses, scene, views),
+                "warnings": warnings_of(job, ready),
                 "scene": scene.to_dict(),
                 "unit": "m" if scene.metric else "units",
                 "views": {"total": len(views), "test": int(views.test.sum()), "width": lens.width, "height": lens.height},
@@ -291,7 +293,7 @@ def rows_at(path: Path, key: str) -> list[dict[str, Any]] | None:
     if not path.is_file():
         return None
     try:
-        kept = read_kept(path, MEASURED_POINT)
+        kept = read_checked(path, MeasuredPoint)
         if kept["key"] == key and not kept["crashed"] and kept["rows"]:
             return [dict(row) for row in kept["rows"]]
     except (InputError, KeyError, TypeError, ValueError):

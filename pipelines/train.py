@@ -7,22 +7,20 @@ from typing import Annotated
 
 import typer
 
-from fieldfuse.pipelines.options import Pairs, Quiet, Threads
+from fieldfuse.pipelines.options import Options, bound_threads, takes
 
 
+@takes("threads pairs quiet")
 def train(
     config: Annotated[Path | None, typer.Option(help="Training settings (YAML); see configs/train/ and docs/training.md.")] = None,
     out: Annotated[Path, typer.Option(help="Folder of checkpoints, learning curve, validation pictures and weights.")] = Path("training"),
     resume: Annotated[bool, typer.Option("--resume", help="Go on from the newest checkpoint in the folder.")] = False,
     steps: Annotated[int | None, typer.Option(help="Stop after so many steps in all; the schedule stays.", min=1)] = None,
-    threads: Threads = None,
-    pairs: Pairs = None,
-    quiet: Quiet = False,
+    *,
+    options: Options,
 ) -> None:
     """Train the networks that turn pictures into a field without fitting; writes `weights.safetensors`."""
-    from fieldfuse.pipelines.thread_limits import bound_threads
-
-    bound_threads({"flags": {"threads": threads}})
+    bound_threads({"flags": {"threads": options.threads}})
     from fieldfuse.errors import Interrupted
     from fieldfuse.nerfusion.training.distributed import join_crew
     from fieldfuse.nerfusion.training.settings import load_train_settings
@@ -30,19 +28,20 @@ def train(
     from fieldfuse.pipelines.console import make_progress
     from fieldfuse.pipelines.job import set_threads
 
-    settings = load_train_settings(config, pairs=pairs or ())
-    set_threads(threads or settings.threads)
+    settings = load_train_settings(config, pairs=options.pairs or ())
+    set_threads(options.threads or settings.threads)
     with join_crew(settings.device) as crew:
         trainer = Trainer(settings, out, crew, resume)
-        if crew.leads and not quiet:
+        quiet = options.quiet or not crew.leads
+        if not quiet:
             for note in trainer.notes:
                 typer.echo(f"note: {note}")
-        progress = make_progress(quiet or not crew.leads)
+        progress = make_progress(quiet)
         with progress.listening():
             progress.begin("training")
             taken = trainer.run(steps, progress)
         stopped = progress.stopping() and taken < min(steps or settings.total_steps, settings.total_steps)
-    if crew.leads and not quiet:
+    if not quiet:
         if trainer.caution.met:
             typer.echo(f"note: {trainer.caution.met} steps were not finite and moved nothing, the last at {trainer.caution.last}")
         typer.echo(f"{out / WEIGHTS} ({taken} steps)")

@@ -6,42 +6,35 @@ from typing import Annotated
 
 import typer
 
-from fieldfuse.pipelines.options import Baked, Config, Device, OptionalOut, Pairs, Quiet, Target, Threads, gather
+from fieldfuse.pipelines.options import Options, Place, bound_threads, takes
 
-KEPT = "cameras_kept.json"
+CAMERAS = "cameras_kept.json"
 
 
+@takes("baked device threads config pairs quiet")
 def view(
-    target: Target,
-    out: OptionalOut = None,
+    place: Place,
     port: Annotated[int, typer.Option(min=0, max=65535, help="Where the page is served; the next free one if it is taken. 0: any.")] = 8080,
     host: Annotated[str, typer.Option(help="Address to listen at. 0.0.0.0: others in the network can look, too.")] = "127.0.0.1",
     image_size: Annotated[int, typer.Option(min=64, max=4096, help="Long side in pixels of a picture at rest.")] = 800,
-    baked: Baked = False,
-    device: Device = None,
-    threads: Threads = None,
-    config: Config = None,
-    pairs: Pairs = None,
-    quiet: Quiet = False,
+    *,
+    options: Options,
 ) -> None:
     """Walk through the field of a run in the browser (of a source, it is fitted first). Ctrl-C ends it."""
-    from fieldfuse.pipelines.thread_limits import bound_threads
-
-    options = gather(None, config, pairs, device=device, threads=threads)
-    bound_threads(options)
+    settings = options.settings()
+    bound_threads(settings)
     from fieldfuse.pipelines.console import make_progress
+    from fieldfuse.pipelines.fields import finished_field
     from fieldfuse.pipelines.job import open_job
-    from fieldfuse.pipelines.live import Live, Shown, require_server
     from fieldfuse.pipelines.pictures import camera_of
-    from fieldfuse.pipelines.reconstruct import BEFORE, stand
-    from fieldfuse.pipelines.steps_results import fit_radiance_field
+    from fieldfuse.pipelines.prepare import BEFORE, prepare
+    from fieldfuse.pipelines.viewer import Live, Shown, require_server
 
     require_server(host)
-    with open_job(target, out, options, make_progress(quiet), (*BEFORE, "field")) as job:
-        _, _, _, scene, ready = stand(job)
-        field, _ = fit_radiance_field(job, ready, scene)
-        render, place = camera_of(job, field, ready, scene, baked), (out or target) / KEPT
-        shown = Shown(job.source.name, render, ready, scene.median_depth, place, scene.working_from_input)
+    with open_job(place, settings, make_progress(options.quiet), (*BEFORE, "field")) as job:
+        ready = prepare(job)
+        render = camera_of(job, finished_field(job, ready).field, ready.views, ready.scene, options.baked)
+        shown = Shown(job.source.name, render, ready, place.folder / CAMERAS)
     with Live(shown, host, port, image_size) as live:  # the run's folder is free again: others may work in it
         typer.echo(f"{live.address} shows the field; Ctrl-C ends it")
         live.wait()

@@ -7,10 +7,12 @@ from multiprocessing import get_context
 
 
 def fits() -> None:
-    from fieldfuse.training import numba_warm
+    from fieldfuse.config import load_settings
+    from fieldfuse.progress import SILENT
+    from fieldfuse.training.engine import warm_up
 
     for decoder in ("deferred", "per_sample"):
-        numba_warm.run(decoder, 16, 16)
+        warm_up(load_settings(pairs=["device=cpu", f"field.decoder={decoder}", "field.channels=16", "field.hidden=16"]), SILENT)
 
 
 def matching() -> None:

@@ -99,8 +99,13 @@ def test_sensor_depth_is_fused(scene: ff.Scene, tmp_path: Path) -> None:
 
 
 def test_the_networks_alone_give_a_field(scene: ff.Scene) -> None:
-    field = ff.infer(scene, settings={"keyframes.most": 3, "network.voxels": 16, "network.agreement": False})
-    assert ff.evaluate(field, scene).psnr > 12
+    settings = {"keyframes.most": 3, "network.voxels": 16, "network.agreement": False}
+    score = ff.evaluate(ff.infer(scene, settings=settings), scene).psnr
+    assert score is not None and score > 12
+    field = ff.fit(scene, finetune=False, init="auto", settings=settings)
+    assert len(field.timeline) == 0 and ff.evaluate(field, scene).psnr == pytest.approx(score, abs=0.01)
+    with pytest.raises(ff.InputError, match="without fine-tuning"):
+        ff.fit(scene, finetune=False)  # its start is classical
 
 
 def test_a_listener_hears_every_stage_and_may_stop(scene: ff.Scene) -> None:

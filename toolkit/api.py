@@ -27,8 +27,7 @@ import numpy as np
 from fieldfuse import steps
 from fieldfuse.config import Settings
 from fieldfuse.errors import InputError
-from fieldfuse.options import OF_FIT, OF_SURFACE, Listener, changed_settings, chosen_settings, listening
-from fieldfuse.results import Field, Scene, Scores, Surface
+from fieldfuse.results import OF_FIT, OF_SURFACE, Field, Listener, Scene, Scores, Surface, changed_settings, chosen_settings, listening
 
 log = logging.getLogger("fieldfuse")
 
@@ -92,7 +91,7 @@ def load(
 
 
 def fit(scene: Scene, budget: float | None = None, *, progress: Listener = None, start: Field | None = None, **options: Any) -> Field:
-    """Fit a field to the training views.
+    """Fit a field to the training views. With `finetune=False` nothing is fitted: the result is what `infer` gives.
 
     Args:
         budget: seconds; None: as the preset has it.
@@ -103,11 +102,16 @@ def fit(scene: Scene, budget: float | None = None, *, progress: Listener = None,
     Raises:
         InputError: a setting is not usable, or there are no training views.
     """
+    from fieldfuse.training.fit import Begin
     from fieldfuse.training.guided import fit_guided
     from fieldfuse.training.network_start import network_start
-    from fieldfuse.volume.grid_host import host_for
+    from fieldfuse.volume.grid import host_for
 
     settings = changed_settings(scene.settings, {**options, **({} if budget is None else {"budget": budget})}, OF_FIT)
+    if not settings.fit.finetune:
+        if start is not None or settings.field.init == "classical":
+            raise InputError("without fine-tuning the networks' field is the result, so it has no start; leave out start or finetune=False")
+        return infer(scene, progress=progress, **options)
     with steps.seeded(settings.seed):
         first = None if start is None else start.sparse
         if first is None and steps.starts_from_networks(scene.views, settings):
@@ -118,9 +122,7 @@ def fit(scene: Scene, budget: float | None = None, *, progress: Listener = None,
             scene.geometry,
             settings,
             listening(progress, "fit"),
-            host=host_for(settings.device),
-            start=first,
-            coarse=first is not None and start is None,
+            Begin(host_for(settings.device), first, coarse=first is not None and start is None),
         )
     for note in result.notes:
         log.warning("%s", note)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import tempfile
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
 from pathlib import Path
@@ -13,9 +13,9 @@ import numpy as np
 
 from fieldfuse import steps
 from fieldfuse.camera import Array, Intrinsics, Similarity
-from fieldfuse.config import Settings
+from fieldfuse.config import Settings, load_settings, settings_dict
 from fieldfuse.errors import InputError
-from fieldfuse.options import OF_SURFACE, Listener, changed_settings, listening
+from fieldfuse.progress import SILENT, Bar, Callback, Progress
 from fieldfuse.tone import exposed
 
 if TYPE_CHECKING:
@@ -25,6 +25,10 @@ if TYPE_CHECKING:
     from fieldfuse.poses.scene import Scene as Geometry
     from fieldfuse.render.field import Field as SparseField
     from fieldfuse.tsdf.volume import TsdfVolume
+
+Listener = Progress | Callable[[str, float, float, str], "bool | None"] | bool | None
+OF_FIT = ("field", "fit", "network", "keyframes", "engine", "device", "threads", "seed")  # settings that a scene does not depend on
+OF_SURFACE = ("tsdf", "export")
 
 
 @dataclass(frozen=True)
@@ -172,9 +176,40 @@ class Points:
         write_points(path, self.points, self.colours, self.normals)
 
 
+class Renderable:
+    """What cameras see: a field or a surface, with the transform to the source's frame."""
+
+    working_from_input: Similarity
+    exposure: float
+
+    def working(self, intrinsics: Intrinsics, world_from_camera: Array) -> Any:
+        """What a camera of the working frame sees: `rgb`, `depth`, `opacity`."""
+        raise NotImplementedError
+
+    @overload
+    def render(self, camera: Camera) -> Render: ...
+    @overload
+    def render(self, camera: Iterable[Camera]) -> list[Render]: ...
+    def render(self, camera: Camera | Iterable[Camera]) -> Render | list[Render]:
+        """What one or several cameras see.
+
+        Raises:
+            InputError: a camera with a distorting lens.
+        """
+        if not isinstance(camera, Camera):
+            return [self.render(one) for one in camera]
+        if camera.intrinsics.distorted:
+            raise InputError("a render is a pinhole camera's; use camera.intrinsics.pinhole()")
+        made = self.working(camera.intrinsics, self.working_from_input.poses(camera.world_from_camera))
+        rgb = np.asarray(made.rgb)
+        rgb = rgb if rgb.dtype == np.uint8 else np.round(np.clip(rgb, 0, 1) * 255).astype(np.uint8)
+        depth = (np.asarray(made.depth) / self.working_from_input.scale).astype(np.float32)
+        return Render(exposed(rgb, self.exposure), depth, np.asarray(made.opacity, dtype=np.float32))
+
+
 @dataclass(frozen=True)
-class Surface:
-    """A fused surface (a truncated signed distance field in Open3D's hash map), with the way back to the source's frame."""
+class Surface(Renderable):
+    """A fused surface (a truncated signed distance field in Open3D's hash map), with the transform to the source's frame."""
 
     volume: TsdfVolume
     working_from_input: Similarity
@@ -193,22 +228,14 @@ class Surface:
         back, found = self.working_from_input.inverse(), self.volume.points()
         return Points(back.points(found.points), exposed(found.colours, self.exposure), back.directions(found.normals))
 
-    @overload
-    def render(self, camera: Camera) -> Render: ...
-    @overload
-    def render(self, camera: Iterable[Camera]) -> list[Render]: ...
-    def render(self, camera: Camera | Iterable[Camera]) -> Render | list[Render]:
-        """What one or several cameras see."""
-        return _render(self, camera)
-
     def working(self, intrinsics: Intrinsics, world_from_camera: Array) -> Any:
         """The same in the working frame: `rgb`, `depth`, `opacity`, and `mask` (H, W) where there is surface."""
         return self.volume.render(intrinsics, world_from_camera)
 
 
 @dataclass(frozen=True)
-class Field:
-    """A radiance field on sparse voxel blocks, with the way back to the source's frame.
+class Field(Renderable):
+    """A radiance field on sparse voxel blocks, with the transform to the source's frame.
 
     Attributes:
         sparse: blocks, features and decoder, in the working frame.
@@ -224,14 +251,6 @@ class Field:
     scene: Scene | None = None
     timeline: Sequence[Mapping[str, Any]] = ()
     notes: Sequence[str] = ()
-
-    @overload
-    def render(self, camera: Camera) -> Render: ...
-    @overload
-    def render(self, camera: Iterable[Camera]) -> list[Render]: ...
-    def render(self, camera: Camera | Iterable[Camera]) -> Render | list[Render]:
-        """What one or several cameras see."""
-        return _render(self, camera)
 
     def working(self, intrinsics: Intrinsics, world_from_camera: Array) -> Any:
         """The same in the working frame: `rgb` (H, W, 3) float32 in [0, 1], `depth`, `opacity`."""
@@ -311,18 +330,41 @@ class Scores:
     per_view: list[dict[str, Any]]
 
 
-def _render(result: Field | Surface, camera: Camera | Iterable[Camera]) -> Render | list[Render]:
-    if not isinstance(camera, Camera):
-        return [_seen(result, one) for one in camera]
-    return _seen(result, camera)
+def chosen_settings(options: Mapping[str, Any]) -> Settings:
+    """Those of a preset, changed.
+
+    Raises:
+        InputError: there is no such setting, or its value does not fit.
+    """
+    given = flattened(options)
+    preset = given.pop("preset", "balanced")
+    return load_settings(preset, flags=given)
 
 
-def _seen(result: Field | Surface, camera: Camera) -> Render:
-    way = result.working_from_input
-    if camera.intrinsics.distorted:
-        raise InputError("a render is a pinhole camera's; use camera.intrinsics.pinhole()")
-    made = result.working(camera.intrinsics, way.poses(camera.world_from_camera))
-    rgb = np.asarray(made.rgb)
-    rgb = rgb if rgb.dtype == np.uint8 else np.round(np.clip(rgb, 0, 1) * 255).astype(np.uint8)
-    depth = (np.asarray(made.depth) / way.scale).astype(np.float32)
-    return Render(exposed(rgb, result.exposure), depth, np.asarray(made.opacity, dtype=np.float32))
+def flattened(options: Mapping[str, Any]) -> dict[str, Any]:
+    """Keywords, and by their full names those in `settings`."""
+    return {**(options.get("settings") or {}), **{name: value for name, value in options.items() if name != "settings"}}
+
+
+def changed_settings(settings: Settings, options: Mapping[str, Any], allowed: tuple[str, ...]) -> Settings:
+    """The settings of a scene with some changed that the scene itself does not depend on.
+
+    Raises:
+        InputError: a setting that decides the scene, or one that is not usable.
+    """
+    before = settings_dict(settings)
+    made = load_settings(settings.preset, flags=flattened(options), stored=before)
+    after = settings_dict(made)
+    fixed = sorted(name for name in after if after[name] != before[name] and name not in allowed)
+    if fixed:
+        raise InputError(f"the settings {', '.join(fixed)} decide the scene; give them to load()")
+    made.device = steps.choose_device(made.device, made.engine)
+    return made
+
+
+def listening(progress: Listener, stage: str) -> Progress:
+    if isinstance(progress, Progress):
+        return progress
+    if progress is None or progress is False:
+        return SILENT
+    return Bar(stage) if progress is True else Callback(progress, stage)

@@ -30,7 +30,7 @@ if TYPE_CHECKING:
     from fieldfuse.poses.points import Features
     from fieldfuse.poses.result import PoseResult
     from fieldfuse.poses.scene import Scene
-    from fieldfuse.training.from_network import Inference
+    from fieldfuse.training.from_network import Inference, NetworkOptions
 
 
 def set_seeds(seed: int) -> None:
@@ -79,34 +79,18 @@ def choose_device(wanted: str, engine: str = "auto") -> str:
     Raises:
         InputError: `cuda` is wanted and there is none, or an engine that cannot run on the device.
     """
-    device = _device(wanted)
-    check_engine(engine, device)
-    return device
-
-
-def check_engine(engine: str, device: str) -> None:
-    """Refuse the engine for CUDA where its kernels cannot run.
-
-    Raises:
-        InputError: saying why.
-    """
     import torch
 
     from fieldfuse.backends.dispatch import triton_runs_on
 
+    there = torch.cuda.is_available()
+    if wanted == "cuda" and not there:
+        raise InputError("device is 'cuda' but torch finds no CUDA device here; use --device cpu or install torch with CUDA")
+    device = wanted if wanted != "auto" else "cuda" if there else "cpu"
     if engine == "triton" and not triton_runs_on(torch.device(device)):
         why = "Triton for it is not installed, or it is too old" if device == "cuda" else f"the device is {device!r}"
         raise InputError(f"engine is 'triton', which runs on CUDA alone, and {why}; leave --engine at auto")
-
-
-def _device(wanted: str) -> str:
-    import torch
-
-    if wanted == "auto":
-        return "cuda" if torch.cuda.is_available() else "cpu"
-    if wanted == "cuda" and not torch.cuda.is_available():
-        raise InputError("device is 'cuda' but torch finds no CUDA device here; use --device cpu or install torch with CUDA")
-    return wanted
+    return device
 
 
 def read_capture(source: Path, settings: Settings, progress: Progress = SILENT) -> Capture:
@@ -220,8 +204,8 @@ def prepared(
     return views if corrections is None else corrections.on_views(views)
 
 
-def key_frames(views: Views, scene: Scene, settings: Settings) -> KeyFrames:
-    """Key frames among the training views and their neighbours, as indices into the training views."""
+def key_frames(views: Views, scene: Scene, settings: Settings, sharp: bool = True) -> KeyFrames:
+    """Key frames among the training views and their neighbours, as indices into the training views; `sharp`: blurred images give way."""
     from fieldfuse.capture.subset import sharpness
     from fieldfuse.nerfusion.keyframes import KeyFrames, select_keyframes
 
@@ -236,7 +220,7 @@ def key_frames(views: Views, scene: Scene, settings: Settings) -> KeyFrames:
         method=wanted.method,
         most=wanted.most,
         every=wanted.every,
-        sharpness=np.array([sharpness(views.images[int(index)]) for index in train]),
+        sharpness=np.array([sharpness(views.images[int(index)]) for index in train]) if sharp else None,
     )
 
 
@@ -259,12 +243,14 @@ def require_weights(settings: Settings) -> Path:
     return weights
 
 
-def direct_inference(views: Views, scene: Scene, keys: KeyFrames, settings: Settings) -> Inference:
-    """The networks, ready to fuse key frame after key frame."""
+def direct_inference(
+    views: Views, scene: Scene, keys: KeyFrames, settings: Settings, options: NetworkOptions | None = None
+) -> Inference:
+    """The networks, ready to fuse key frame after key frame; `options`: other ones than those of the settings."""
     from fieldfuse.training.from_network import Inference, NetworkOptions, load_networks
 
     model = load_networks(require_weights(settings), settings.device)
-    return Inference(model, views, scene, keys, settings.field.background, NetworkOptions.of(settings.network))
+    return Inference(model, views, scene, keys, settings.field.background, options or NetworkOptions.of(settings.network))
 
 
 def starts_from_networks(views: Views, settings: Settings) -> bool:

@@ -197,7 +197,7 @@ FAULTS = (
     fault(
         "background over everything",
         "skipped step",
-        ("colour = colour + (1 - opacity)[:, None] * field.background", "colour = colour + field.background[None]"),
+        ("colour = shown.colour + (1 - shown.opacity)[:, None] * field.background", "colour = shown.colour + field.background[None]"),
     ),
     # Per-scene fit
     fault(
@@ -227,10 +227,7 @@ FAULTS = (
     fault(
         "numba: weight of thin samples",
         "wrong sign",
-        (
-            "weight = transmittance * tau * (ONE - tau * HALF * (ONE - tau * THIRD))",
-            "weight = transmittance * tau * (ONE + tau * HALF * (ONE - tau * THIRD))",
-        ),
+        ("return before * tau * (ONE - tau * HALF * (ONE", "return before * tau * (ONE + tau * HALF * (ONE"),
     ),
     fault(
         "numba: lazy Adam's step",

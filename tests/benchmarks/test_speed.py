@@ -15,7 +15,7 @@ from fieldfuse.camera import pixel_grid, rays
 from fieldfuse.evaluation.sphere import CHANNELS, around, lens, sphere_field, sphere_pixels
 from fieldfuse.render.bake import bake
 from fieldfuse.render.march import march
-from fieldfuse.training.numba_engine import NumbaOptimiser
+from fieldfuse.training.numba_engine import NumbaEngine
 from tests.pipelines.made import bench
 
 
@@ -29,7 +29,7 @@ def test_a_ray_looks_up_and_touches_a_bounded_number_of_rows() -> None:
     """A wall of eight voxels with an optical thickness of about ½ each, crossed at most twice, is left after few samples."""
     counts = {}
     for size in (32, 64):
-        engine = NumbaOptimiser(sphere_field(size), sphere_pixels(48), threads=1)
+        engine = NumbaEngine(sphere_field(size), sphere_pixels(48), threads=1)
         counts[size] = speed_cases.step_counts(engine)
         assert 3 < counts[size]["looked_up_a_ray"] < 24
         # A first step touches the corners beside what it saw, each once: never more than eight a sample, and far fewer when rays meet.
@@ -43,7 +43,7 @@ def test_empty_space_is_skipped_and_light_that_is_spent_ends_a_ray() -> None:
     origins, directions, _ = rays(lens(32, 32), around()[1], pixel_grid(32, 32))
     samples = march(field.grid, origins, directions, field.near, field.fine)
     assert len(samples) / len(origins) < 30  # of about 150 fine steps through the lattice: the rest is empty
-    engine = NumbaOptimiser(field, sphere_pixels(48), threads=1)
+    engine = NumbaEngine(field, sphere_pixels(48), threads=1)
     assert speed_cases.step_counts(engine)["looked_up_a_ray"] < 0.8 * len(samples) / len(origins)
 
 
@@ -52,7 +52,7 @@ def test_memory_a_voxel() -> None:
     baked = bake(field)
     assert field.bytes / field.voxels < 4 * (CHANNELS + 1) * 4
     assert baked.bytes / baked.voxels < 70
-    engine = NumbaOptimiser(field, sphere_pixels(16), threads=1)
+    engine = NumbaEngine(field, sphere_pixels(16), threads=1)
     rows = len(field.density_rows)
     assert engine.index.nbytes == rows * 8 and engine.marks.nbytes == len(field.occupied) * 2
     assert engine.records.shape == (rows, CHANNELS + 2) and engine.records.itemsize == 2

@@ -12,7 +12,7 @@ import pytest
 from fieldfuse.capture import open_capture
 from fieldfuse.capture.images import load_depth
 from fieldfuse.errors import InputError
-from fieldfuse.pipelines.source_state import source_state
+from fieldfuse.pipelines.source import source_state
 from tests.capture.layouts import OFF_CENTRE, write_replica
 from tests.capture.made import eyes, pixel_error, render, save_depth, save_picture
 

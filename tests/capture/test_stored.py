@@ -14,7 +14,7 @@ from fieldfuse.capture import Capture, open_capture
 from fieldfuse.capture.convert import CONVERTED, convert_pictures, to_convert
 from fieldfuse.capture.headers import orientation_of
 from fieldfuse.capture.images import load_image, upright
-from fieldfuse.pipelines.summary import put_cameras
+from fieldfuse.pipelines.exports import put_cameras
 from fieldfuse.poses.result import SFM, PoseResult
 from tests.capture.board import texture
 

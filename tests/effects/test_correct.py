@@ -19,7 +19,7 @@ from fieldfuse.errors import InputError
 from fieldfuse.evaluation.score import score_views
 from fieldfuse.render.image import Rendered
 from fieldfuse.tone import Tone, share, square_radius
-from fieldfuse.training.rays import PixelPool
+from fieldfuse.training.pixels import PixelPool
 
 CAMERA = Intrinsics(64, 48, 50.0, 50.0, 32.0, 24.0)
 

@@ -17,7 +17,7 @@ from fieldfuse.camera import Intrinsics, project
 from fieldfuse.capture import open_capture
 from fieldfuse.errors import InputError
 from fieldfuse.export.cameras import colmap_model, quaternion, write_cameras
-from fieldfuse.pipelines.surface import sparse_points
+from fieldfuse.pipelines.exports import sparse_points
 from tests.export.samples import cameras, turned
 
 POINTS = np.random.default_rng(2).normal(size=(30, 3))

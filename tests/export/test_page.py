@@ -20,14 +20,12 @@ from fieldfuse.evaluation.sphere import around, lens
 from fieldfuse.export.page import Tour, decoder_blocks, page, require_page, write_page
 from fieldfuse.nerfusion.decoder import Deferred, make_decoder
 from fieldfuse.render.bake import BakedField, bake
-from fieldfuse.render.composite import ray_sum, weights
-from fieldfuse.render.field import density
+from fieldfuse.render.composite import ray_sum
 from fieldfuse.render.image import SOLID, Rendered
 from fieldfuse.render.march import march
-from fieldfuse.render.rays import median_distance
+from fieldfuse.render.rays import _median_distance, shade
 from fieldfuse.render.sky import on_sky
 from fieldfuse.tone import brighter, decode, encode
-from fieldfuse.volume.lookup import corners, gather
 from tests.evaluation.driven import Driven, driven, until
 from tests.render.made import coloured_field, random_field
 
@@ -170,19 +168,13 @@ def drawn(baked: BakedField, pose: Array, stop: float = 1e-2, threshold: float =
     field = baked.to_field()
     origins, directions, cosine = rays(CAMERA, pose, pixel_grid(WIDTH, HEIGHT))
     samples, count = march(field.grid, origins, directions, field.near, field.fine), len(origins)
-    rows, eight = corners(field.topology, samples.cell, samples.inside)
-    thickness = density(gather(field.density_rows, rows, eight)) * samples.length
-    weight, transmittance = weights(thickness, samples.first)
-    reached = transmittance >= stop
-    kept = reached & (weight > threshold)
-    w, ray = weight[kept, None], samples.ray[kept]
-    summed = ray_sum(torch.cat([w * gather(field.feature_rows, rows[kept], eight[kept]), w], 1), ray, count)
-    left = torch.exp(-ray_sum(thickness * reached, samples.ray, count))
+    shown = shade(field, samples, directions, threshold=threshold, stop=stop)
+    left = torch.exp(-ray_sum(shown.thickness * (shown.transmittance >= stop), samples.ray, count))
     opacity = torch.where(left < stop, 1.0, 1 - left)
-    colour = field.decoder(summed[:, :-1] / summed[:, -1:].clamp_min(1e-6), directions)
-    colour = torch.where(summed[:, -1:] > 0, colour * opacity[:, None] + (1 - opacity[:, None]) * field.background, field.background)
+    own = shown.colour / shown.opacity.clamp_min(1e-6)[:, None]
+    colour = torch.where(shown.opacity[:, None] > 0, own * opacity[:, None] + (1 - opacity[:, None]) * field.background, field.background)
     colour = on_sky(colour.clamp(0, 1), opacity, directions, field.background, field.sky)
-    depth = torch.where(opacity >= SOLID, median_distance(samples, transmittance, thickness, count) * cosine, 0.0)
+    depth = torch.where(opacity >= SOLID, _median_distance(samples, shown, count) * cosine, 0.0)
     return Rendered(colour.view(HEIGHT, WIDTH, 3).numpy(), depth.view(HEIGHT, WIDTH).numpy(), opacity.view(HEIGHT, WIDTH).numpy())
 
 

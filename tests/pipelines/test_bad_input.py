@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import fcntl
 import os
 import re
 import resource
@@ -16,7 +15,7 @@ import numpy as np
 import pytest
 
 from fieldfuse.config import load_settings
-from fieldfuse.errors import InputError, OutputError
+from fieldfuse.errors import InputError
 from fieldfuse.pipelines.folder import RunFolder, is_run_folder
 from fieldfuse.pipelines.render_path import read_cameras
 from tests.pipelines.made import CAMERA, Answer, call, circle, make_room, save_picture, shoot, spawn, write_transforms
@@ -292,26 +291,6 @@ def test_a_refusal_leaves_an_earlier_run(tmp_path: Path) -> None:
         (folder / "frames").mkdir()
         raise InputError("found late")
     assert is_run_folder(tmp_path / "new"), "what was written belongs to it"
-
-
-def test_a_lock_that_was_taken_back_is_not_held(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Another command opens the lock, a refused one removes it with its folder, and only then it is locked."""
-    folder, lock, real = tmp_path / "out", tmp_path / "out" / ".lock", fcntl.flock
-
-    def late(file: Any, how: int) -> None:
-        if not removed:
-            removed.append(lock)
-            lock.unlink()
-            folder.rmdir()
-        real(file, how)
-
-    removed: list[Path] = []
-    monkeypatch.setattr(fcntl, "flock", late)
-    with RunFolder(folder):
-        assert removed and lock.is_file()
-        with pytest.raises(OutputError, match="another fieldfuse command"), RunFolder(folder):
-            pass
-    assert lock.is_file()
 
 
 def test_out_folder_of_somebody_else(tmp_path: Path, capsys: Capsys) -> None:

@@ -63,11 +63,11 @@ def compared(tmp_path_factory: pytest.TempPathFactory) -> Path:
     add_truth(folder / "corner")
     from fieldfuse.pipelines.comparison import compare_run
     from fieldfuse.pipelines.console import make_progress
-    from fieldfuse.pipelines.options import gather
+    from fieldfuse.pipelines.options import Place, gather
 
     options = gather("fast", None, [*PAIRS[1:], "export.formats=[ply]", "network.voxels=16"], holdout=4, threads=1)
     with steady():
-        compare_run(folder / "corner", folder / "out", options, "auto", make_progress(quiet=True))
+        compare_run(Place(folder / "corner", folder / "out"), options, "auto", make_progress(quiet=True))
     return folder / "out"
 
 

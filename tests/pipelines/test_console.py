@@ -13,8 +13,7 @@ from types import SimpleNamespace
 import pytest
 
 from fieldfuse.pipelines.console import ConsoleProgress, PlainProgress, RichProgress, clock, make_progress
-from fieldfuse.pipelines.effects_table import show as show_effects
-from fieldfuse.pipelines.info import for_people
+from fieldfuse.pipelines.info import for_people, show_effects
 
 
 class Terminal(io.StringIO):

@@ -20,8 +20,8 @@ from fieldfuse.config import load_settings
 from fieldfuse.effects.correct import Corrections
 from fieldfuse.effects.decide import Decided, asleep, decide, wish
 from fieldfuse.errors import InputError
-from fieldfuse.pipelines.kept import EFFECTS, fitting
-from fieldfuse.pipelines.steps_effects import moved_cameras
+from fieldfuse.pipelines.schemas import Effects, checked
+from fieldfuse.pipelines.summary import refined_cameras
 from fieldfuse.simulate.settings import scene_file
 from fieldfuse.simulate.simulate import simulate
 
@@ -86,7 +86,7 @@ def test_seconds_stand_beside_each_effect(captures: dict[str, Path], monkeypatch
     points = data["looked_at"]["points_seconds"]
     assert points > 0.02 and paid["exposure"] > paid["vignetting"] > 0 and paid["poses"] == pytest.approx(paid["distortion"], abs=0.002)
     assert 0.7 * data["seconds"] < points + sum(paid.values()) < 1.02 * data["seconds"] + 0.01
-    fitting(data, EFFECTS, Path("effects.json"))
+    checked(data, Effects, Path("effects.json"))
 
 
 def test_blurred_pictures_weigh_less(captures: dict[str, Path], tmp_path: Path) -> None:
@@ -142,15 +142,18 @@ def test_how_far_given_cameras_were_moved_is_told() -> None:
         moved[index, :3, :3] = cv2.Rodrigues(np.deg2rad([0.0, index, 0.0]))[0]
     names = ["a", "b", "c", "d"]
     frames = [SimpleNamespace(name=name, world_from_camera=pose) for name, pose in zip(names, given, strict=True)]
-    capture = SimpleNamespace(frames=frames, metric=True, has_depth=True)
-    job = SimpleNamespace(corrections=Corrections(poses=dict(zip(names, moved, strict=False))))
-    (text,) = moved_cameras(job, capture)  # type: ignore[arg-type]
+    refined = Corrections(poses=dict(zip(names, moved, strict=False)))
+
+    def told(corrections: Corrections, metric: bool = True) -> list[str]:
+        capture = SimpleNamespace(frames=frames, metric=metric, has_depth=metric)
+        return refined_cameras(SimpleNamespace(corrections=corrections, capture=capture))  # type: ignore[arg-type]
+
+    (text,) = told(refined)
     assert "moved by 2.0 cm and turned by 1.00°" in text and "effects.off=[poses]" in text and "sensor" in text
-    held = SimpleNamespace(corrections=replace(job.corrections, by_depth=True))
-    (text,) = moved_cameras(held, capture)  # type: ignore[arg-type]
+    by_depth = replace(refined, by_depth=True)
+    (text,) = told(by_depth)
     assert "by its pictures and depth:" in text and "sensor" not in text
-    assert Corrections.from_dict(held.corrections.to_dict()).by_depth and not Corrections.from_dict(job.corrections.to_dict()).by_depth
-    (text,) = moved_cameras(job, SimpleNamespace(frames=frames, metric=False, has_depth=False))  # type: ignore[arg-type]
+    assert Corrections.from_dict(by_depth.to_dict()).by_depth and not Corrections.from_dict(refined.to_dict()).by_depth
+    (text,) = told(refined, metric=False)
     assert "0.02 of the capture's units" in text and "sensor" not in text
-    for corrections in (None, Corrections()):
-        assert moved_cameras(SimpleNamespace(corrections=corrections), capture) == []  # type: ignore[arg-type]
+    assert told(Corrections()) == told(Corrections(poses=dict(zip(names, given, strict=True)))) == []

@@ -11,11 +11,10 @@ import pytest
 
 from fieldfuse.files import read_json
 from fieldfuse.pipelines.console import make_progress
+from fieldfuse.pipelines.fields import fit_radiance_field, starting_field
 from fieldfuse.pipelines.job import open_job
-from fieldfuse.pipelines.options import gather
-from fieldfuse.pipelines.reconstruct import BEFORE, stand
-from fieldfuse.pipelines.steps_capture import choose_frames, find_capture
-from fieldfuse.pipelines.steps_results import fit_radiance_field
+from fieldfuse.pipelines.options import Place, gather
+from fieldfuse.pipelines.prepare import BEFORE, choose_frames, find_capture, prepare
 from tests.capture.films import film
 from tests.pipelines.made import call, circle, shoot
 from tests.pipelines.short import ALONE, finished, stages
@@ -73,9 +72,9 @@ def test_info_tells_what_is_of_an_earlier_field(out: Path, capsys: Capsys) -> No
 
     assert told() == ([], set())
     # As far as a `finetune` comes that is interrupted after its fit.
-    with open_job(out, None, gather(None, None, None, budget=0.3), make_progress(True), BEFORE) as job:
-        _, _, _, scene, views = stand(job)
-        fit_radiance_field(job, views, scene, go_on=True)
+    with open_job(Place(out), gather(None, None, None, budget=0.3), make_progress(True), BEFORE) as job:
+        ready = prepare(job)
+        fit_radiance_field(job, ready, starting_field(job, ready), go_on=True)
     sentences, stale = told()
     assert stale == {"render", "evaluate", "export"} and len(sentences) == 2
     text = call(capsys, "info", out).out
@@ -145,7 +144,7 @@ def test_a_video_that_was_moved_keeps_its_frames(tmp_path: Path) -> None:
     before, now = film(tmp_path / "films" / "walk.mp4", seen), tmp_path / "kept" / "walk.mp4"
     now.parent.mkdir()
     for source in (before, now):
-        with open_job(source, tmp_path / "out", gather(), make_progress(True)) as job:
+        with open_job(Place(source, tmp_path / "out"), gather(), make_progress(True)) as job:
             chosen = choose_frames(job, find_capture(job))
         assert job.stages.cached == dict.fromkeys(("capture", "frames"), source == now)
         assert chosen.root == source.parent and {frame.image.parent for frame in chosen.frames} == {tmp_path / "out" / "frames"}

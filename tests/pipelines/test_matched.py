@@ -16,6 +16,7 @@ from fieldfuse.pipelines.summary import describe_left_out, describe_matching
 from fieldfuse.stereo import transients
 from fieldfuse.stereo.transients import LeftOut, load_left_out
 from tests.pipelines.made import call, save_picture, write_transforms
+from tests.pipelines.short import stages
 from tests.poses.textured import arc, render
 
 Capsys = pytest.CaptureFixture[str]
@@ -49,11 +50,11 @@ def test_a_surface_from_pictures_alone(tmp_path: Path, capsys: Capsys) -> None:
     assert score["depth_from"] == "matching"
     assert score["psnr_masked"] > 18 and score["coverage"] > 0.6
     assert (out / "tsdf" / "mesh.ply").stat().st_size > 10_000
-    stages = {stage["name"]: stage["cached"] for stage in data["stages"]}
-    assert stages["stereo"] is False
+    before = stages(data)
+    assert before["stereo"] is False
 
     again = json.loads(call(capsys, "tsdf", out, "--quiet", "--json").out)
-    assert {stage["name"]: stage["cached"] for stage in again["stages"]} == {**dict.fromkeys(stages, True)}
+    assert stages(again) == dict.fromkeys(before, True)
     # Another command keeps the surface in its report.
     kept = json.loads(call(capsys, "evaluate", out, "--quiet", "--json", *SHORT).out)
     assert kept["evaluation"]["tsdf"]["psnr"] == score["psnr"]

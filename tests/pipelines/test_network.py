@@ -15,33 +15,13 @@ import torch
 
 from fieldfuse.config import load_settings
 from fieldfuse.files import read_json
-from fieldfuse.pipelines.steps_network import uses_network
+from fieldfuse.pipelines.fields import uses_network
 from tests.pipelines.made import CAMERA, call, make_room
-from tests.pipelines.short import start, wait_for
+from tests.pipelines.short import stages, start, wait_for
 
 Capsys = pytest.CaptureFixture[str]
-FAST = [
-    "--init",
-    "network",
-    "--budget",
-    1,
-    "--threads",
-    1,
-    "--set",
-    "field.resolution=64",
-    "--set",
-    "export.formats=[cameras]",
-    "--set",
-    "network.voxels=12",
-    "--set",
-    "tsdf.enabled=off",
-    "--set",
-    "keyframes.most=5",
-]
-
-
-def stages(data: dict[str, Any]) -> dict[str, bool]:
-    return {stage["name"]: stage["cached"] for stage in data["stages"]}
+FAST = ["--init", "network", "--budget", 1, "--threads", 1, "--set", "field.resolution=64", "--set", "export.formats=[cameras]"]
+FAST += ["--set", "network.voxels=12", "--set", "tsdf.enabled=off", "--set", "keyframes.most=5"]
 
 
 def run(capsys: Capsys, room: Path, out: Path, *more: object) -> dict[str, Any]:
@@ -151,12 +131,12 @@ def test_a_run_killed_among_the_key_frames_goes_on(room: Path, tmp_path: Path, c
 def test_which_start_is_automatic(count: int, used: bool) -> None:
     settings = load_settings()
     views = SimpleNamespace(test=np.zeros(count, bool))
-    job = SimpleNamespace(settings=settings, plan=None, again=False)
-    assert uses_network(job, views) is used  # type: ignore[arg-type]
-    job.plan = object()
-    assert not uses_network(job, views)  # type: ignore[arg-type]
+    job: Any = SimpleNamespace(settings=settings, again=False)
+    ready: Any = SimpleNamespace(views=views)
+    assert uses_network(job, ready) is used
+    assert not uses_network(job, ready, planned=True)
     settings.fit.finetune = False
-    assert uses_network(job, views)  # type: ignore[arg-type]
+    assert uses_network(job, ready, planned=True)
 
 
 @pytest.mark.skipif(torch.cuda.is_available(), reason="Triton's engine runs here")

@@ -15,7 +15,7 @@ import pytest
 from fieldfuse.errors import InputError
 from fieldfuse.files import read_json
 from fieldfuse.pipelines.folder import FILES, SUBFOLDERS
-from fieldfuse.pipelines.thread_limits import THREAD_VARIABLES, bound_threads
+from fieldfuse.pipelines.options import THREAD_VARIABLES, bound_threads
 from tests.pipelines.made import bench, call, make_room
 from tests.pipelines.short import FAST, finished, report, stages
 
@@ -63,23 +63,8 @@ def test_tsdf_alone_then_the_rest_in_the_same_folder(tmp_path: Path, capsys: Cap
     assert answer.code == 0, answer.err
     data = json.loads(answer.out)
     assert data["evaluation"]["tsdf"]["psnr"] > 10 and data["evaluation"]["field"] is None
-    answer = call(
-        capsys,
-        "finetune",
-        out,
-        "--budget",
-        1,
-        "--set",
-        "init=classical",
-        "--threads",
-        1,
-        "--set",
-        "field.resolution=32",
-        "--set",
-        "export.formats=[points]",
-        "--quiet",
-        "--json",
-    )
+    options = ["--budget", 1, "--threads", 1, "--set", "init=classical", "--set", "field.resolution=32", "--set", "export.formats=[points]"]
+    answer = call(capsys, "finetune", out, *options, "--quiet", "--json")
     assert answer.code == 0, answer.err
     both = json.loads(answer.out)
     assert both["evaluation"]["tsdf"] == data["evaluation"]["tsdf"] and both["evaluation"]["field"]["psnr"] > 10
@@ -193,5 +178,5 @@ def test_waiting_threads_sleep_soon_unless_told_otherwise(
 
 def test_threads_are_bounded_before_numpy_is_loaded() -> None:
     """NumPy's BLAS reads the count when it is loaded; later it is too late."""
-    code = "import sys; from fieldfuse.pipelines import cli, run, work, thread_limits; sys.exit('numpy' in sys.modules)"
+    code = "import sys; from fieldfuse.pipelines import cli, options, run; sys.exit('numpy' in sys.modules)"
     assert subprocess.run([sys.executable, "-c", code], check=False).returncode == 0

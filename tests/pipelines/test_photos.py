@@ -18,9 +18,9 @@ import pytest
 from PIL import Image
 
 from fieldfuse.capture.types import Capture, Frame
-from fieldfuse.pipelines.steps_capture import at_home
+from fieldfuse.pipelines.prepare import in_folder
 from tests.pipelines.made import CAMERA, call, circle, command, environment, look_at, make_photos, shoot
-from tests.pipelines.short import HUNG
+from tests.pipelines.short import HUNG, stages
 
 Capsys = pytest.CaptureFixture[str]
 PHOTO = CAMERA.scaled(288, 216)
@@ -48,7 +48,7 @@ def test_photos_get_poses_and_the_report_says_what_the_poses_have_seen(photos: P
     assert any("held-out ones included" in warning for warning in data["warnings"])
     assert (tmp_path / "out" / "exports" / "cameras" / "colmap").is_dir()
     again = as_json(call(capsys, "poses", tmp_path / "out", "--quiet", "--json").out)
-    assert {stage["name"]: stage["cached"] for stage in again["stages"]}["poses"]
+    assert stages(again)["poses"]
 
 
 def test_video_is_cut_into_frames(tmp_path: Path, capsys: Capsys) -> None:
@@ -70,7 +70,7 @@ def test_video_is_cut_into_frames(tmp_path: Path, capsys: Capsys) -> None:
     assert len(frames) == data["capture"]["frames"]
     frames[2].unlink()
     again = as_json(call(capsys, "poses", path, "--out", tmp_path / "out", *options).out)
-    assert {stage["name"]: stage["cached"] for stage in again["stages"]} == {"capture": True, "frames": False, "poses": False}
+    assert stages(again) == {"capture": True, "frames": False, "poses": False}
     assert frames[2].is_file()
 
 
@@ -82,7 +82,7 @@ def test_the_frames_of_a_run_folder_that_was_moved_are_its_own(tmp_path: Path) -
     kept = [tmp_path / "photos" / "a.jpg", tmp_path / "frames" / "b.jpg"]  # photos that needed no writing
     frames = [Frame(str(index), path) for index, path in enumerate([before / "a.jpg", *kept])]
     deep = [replace(frames[0], depth=before / "depth" / "a.png"), replace(frames[0], depth=tmp_path / "depth" / "a.png")]
-    got = at_home(Capture("photos", tmp_path, (*frames, *deep)), now)
+    got = in_folder(Capture("photos", tmp_path, (*frames, *deep)), now)
     assert [frame.image for frame in got.frames] == [now / "a.jpg", *kept, now / "a.jpg", now / "a.jpg"]
     assert [frame.depth for frame in got.frames[3:]] == [now / "depth" / "a.png", deep[1].depth]
 
@@ -103,7 +103,7 @@ def test_heic_photos_become_jpegs_that_the_cameras_name(photos: Path, tmp_path: 
     assert named.endswith(".jpg") and (out / named).is_file()
     (out / named).unlink()
     again = as_json(call(capsys, "poses", source, "--out", out, "--threads", 1, "--quiet", "--json").out)
-    assert {stage["name"]: stage["cached"] for stage in again["stages"]} == {"capture": True, "frames": False, "poses": False}
+    assert stages(again) == {"capture": True, "frames": False, "poses": False}
     assert (out / named).is_file()
 
 

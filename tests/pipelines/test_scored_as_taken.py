@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
+from typing import Any
 
 import cv2
 import numpy as np
@@ -24,7 +25,7 @@ from fieldfuse.files import read_json
 from fieldfuse.pipelines.cli import app
 from fieldfuse.pipelines.pictures import camera_of
 from fieldfuse.pipelines.rendered import Pictures, load_pictures, to_picture, write_pngs
-from fieldfuse.pipelines.surface import write_surface
+from fieldfuse.pipelines.surfaces import write_surface
 from fieldfuse.render.image import render_view
 from fieldfuse.simulate.settings import scene_file
 from fieldfuse.simulate.simulate import simulate
@@ -101,7 +102,7 @@ def test_cameras_points_and_meshes_show_it_as_bright_as_it_was_taken(tmp_path: P
     colours = np.random.default_rng(0).integers(0, 256, (4, 3), dtype=np.uint8)
     corners = np.array([[0.0, 0, 0], [1, 0, 0], [0, 1, 0], [0, 0, 1]])
     mesh = Mesh.create(corners, np.array([[0, 1, 2], [0, 3, 1]]), colours, np.tile([0.0, 0, 1], (4, 1)))
-    scene = SimpleNamespace(working_from_input=Similarity.identity())
-    write_surface(tmp_path, scene, mesh, Points(corners, colours, np.tile([0.0, 0, 1], (4, 1))), 1.5)  # type: ignore[arg-type]
+    ready: Any = SimpleNamespace(scene=SimpleNamespace(working_from_input=Similarity.identity()), views=SimpleNamespace(exposure=1.5))
+    write_surface(ready, tmp_path, mesh, Points(corners, colours, np.tile([0.0, 0, 1], (4, 1))))
     assert np.array_equal(read_mesh(tmp_path / "mesh.ply").colours, exposed(colours, 1.5))
     assert np.array_equal(trimesh.load(tmp_path / "points.ply").colors[:, :3], exposed(colours, 1.5))  # type: ignore[union-attr]

@@ -2,22 +2,29 @@
 
 from __future__ import annotations
 
+import gc
+import mmap
 import os
 import signal
 import subprocess
 import sys
 import textwrap
+import time
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+import psutil
 import pytest
 
 from fieldfuse.config import Settings
 from fieldfuse.errors import InputError, Interrupted, OutputError
 from fieldfuse.files import read_json, write_json
+from fieldfuse.memory import give_back
 from fieldfuse.pipelines.console import ConsoleProgress
 from fieldfuse.pipelines.folder import RunFolder
-from fieldfuse.pipelines.stages import Stages, finished_stages
+from fieldfuse.pipelines.stages import CollectingStage, EndlessStage, PeakMemory, Stage, Stages, finished_stages, own_bytes
 
 
 class Chain:
@@ -65,7 +72,7 @@ class Chain:
                 raise InputError(f"{path} is damaged")
             return int(text)
 
-        return stages.run(name, make, save, load, uses=uses, after=after, keeps=keeps)
+        return stages.run((EndlessStage if keeps else Stage)(name, make, save, load, after, uses))
 
 
 def test_finished_stages_are_reused(tmp_path: Path) -> None:
@@ -154,19 +161,9 @@ def test_outputs_that_are_no_longer_made_are_removed(tmp_path: Path, adds: bool,
                     path.write_text("here")
                 return paths
 
-            stages.run("only", lambda: count, save, lambda: 0, uses=count, adds=adds)  # noqa: B023
+            kind = CollectingStage if adds else Stage
+            stages.run(kind("only", lambda: count, save, lambda: 0, settings=count))  # noqa: B023
         assert sorted(path.name for path in folder.path.glob("*.txt")) == left == sorted(stages.records["only"].outputs)
-
-
-def test_memory_of_children_counts(tmp_path: Path) -> None:
-    program = "import time; block = bytearray(300 * 2**20); time.sleep(1.5)"
-    with RunFolder(tmp_path / "run") as folder:
-        stages = Stages(folder, ConsoleProgress())
-        stages.run("idle", lambda: 0, lambda value: [], lambda: 0)
-        stages.run("child", lambda: subprocess.run([sys.executable, "-c", program], check=True).returncode, lambda value: [], lambda: 0)
-        idle, child = (stages.records[name].peak_memory_mb for name in ("idle", "child"))
-    assert child > idle + 250
-    assert stages.records["child"].seconds >= 1.5
 
 
 KILLED = """
@@ -174,7 +171,7 @@ import os, signal, sys
 from pathlib import Path
 from fieldfuse.pipelines.console import ConsoleProgress
 from fieldfuse.pipelines.folder import RunFolder
-from fieldfuse.pipelines.stages import Stages
+from fieldfuse.pipelines.stages import Stage, Stages
 from fieldfuse.config import Settings
 from fieldfuse.files import atomic_path
 
@@ -200,7 +197,7 @@ with RunFolder(Path(sys.argv[1])) as folder:
         die("saved")
         return [path]
 
-    print(stages.run("only", make, save, path.read_text))
+    print(stages.run(Stage("only", make, save, path.read_text)))
     die("after")
 """
 
@@ -260,3 +257,48 @@ def test_a_full_disk_is_said_in_a_sentence(tmp_path: Path) -> None:
     for error in (OSError(28, "No space left on device"), RuntimeError("write failed: No space left on device (os error 28)")):
         with pytest.raises(OutputError, match="No space left"), RunFolder(tmp_path):
             raise error
+
+
+SIZE = 2**27  # 128 MiB
+
+
+def until(reached: Callable[[], bool], seconds: float = 200) -> None:
+    """Wait for the thread that samples, which a busy machine may hold up; what never comes is for the test to find."""
+    end = time.monotonic() + seconds
+    while not reached() and time.monotonic() < end:
+        time.sleep(0.05)
+
+
+def test_what_was_taken_and_given_back_is_remembered() -> None:
+    gc.collect()
+    give_back()  # else the thread may see as much given back as is taken
+    before = own_bytes(psutil.Process().memory_info()) / 2**20  # without pages of files, which a system short of memory drops
+    with PeakMemory() as memory:
+        held = np.ones(SIZE, np.uint8)
+        until(lambda: memory.own > before + 100)
+        del held
+    assert memory.own > before + 100
+    assert memory.own <= memory.megabytes
+
+
+def test_files_are_memory_but_not_its_own(tmp_path: Path) -> None:
+    path = tmp_path / "large"
+    path.write_bytes(bytes(SIZE))
+    own = own_bytes(psutil.Process().memory_info()) / 2**20
+    with path.open("rb") as file, mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_READ) as mapped, PeakMemory() as memory:
+        assert not np.frombuffer(bytes(mapped[:: mmap.PAGESIZE]), np.uint8).any()  # each page is looked at
+        until(lambda: memory.megabytes > own + 60)
+    if not hasattr(psutil.Process().memory_info(), "shared"):
+        pytest.skip("this system does not tell pages of files apart")
+    assert memory.own < own + 60 < memory.megabytes
+
+
+def test_children_count() -> None:
+    program = f"import time; held = bytearray(b'1') * {SIZE}; print('there', flush=True); time.sleep(400)"
+    before = psutil.Process().memory_info().rss / 2**20
+    with PeakMemory() as memory, subprocess.Popen([sys.executable, "-c", program], stdout=subprocess.PIPE) as child:
+        assert child.stdout is not None
+        child.stdout.readline()
+        until(lambda: memory.megabytes > before + 100)
+        child.kill()
+    assert memory.megabytes > before + 100

@@ -16,8 +16,8 @@ from fieldfuse.export.surface import Originals
 from fieldfuse.files import read_json
 from fieldfuse.pipelines.console import make_progress
 from fieldfuse.pipelines.job import open_job
-from fieldfuse.pipelines.options import gather
-from fieldfuse.pipelines.reconstruct import stand
+from fieldfuse.pipelines.options import Place, gather
+from fieldfuse.pipelines.prepare import prepare
 from fieldfuse.tone import Tone
 from tests.pipelines.made import CAMERA, call, make_room, said
 from tests.pipelines.short import ALONE, steady
@@ -51,11 +51,12 @@ def test_a_texture_has_texels_of_the_photos(run: Path, tmp_path: Path, capsys: C
 def test_pictures_are_as_large_as_they_were_taken(run: Path, side: int, expected: int | None) -> None:
     """Up to so many pixels; where that is no more than the fit has, its own pictures."""
     options = gather(None, None, None, image_size=48)
-    with open_job(run / "room", run / "other", options, make_progress(True)) as job:
-        _, _, posed, _, views = stand(job)
+    with open_job(Place(run / "room", run / "other"), options, make_progress(True)) as job:
+        ready = prepare(job)
+        posed, views = ready.posed, ready.views
         train = np.flatnonzero(~views.test)
         shown = views.subset(train)
-        lenses, pictures = Originals(posed, job.corrections).at(train, shown, side)
+        lenses, pictures = Originals(posed, ready.corrections).at(train, shown, side)
         found = list(pictures)
     assert len(found) == len(lenses) == len(train)
     if expected is None:
@@ -71,26 +72,29 @@ def test_pictures_are_as_large_as_they_were_taken(run: Path, side: int, expected
 
 
 def test_large_pictures_are_corrected_as_those_of_the_fit(run: Path) -> None:
-    with open_job(run / "room", run / "other", gather(None, None, None, image_size=48), make_progress(True)) as job:
-        _, _, posed, _, views = stand(job)
+    with open_job(Place(run / "room", run / "other"), gather(None, None, None, image_size=48), make_progress(True)) as job:
+        ready = prepare(job)
+        posed, views = ready.posed, ready.views
         shown = views.subset([1])
-        plain = next(iter(Originals(posed, job.corrections).at(np.array([1]), shown, 1280)[1]))
-        job.corrections = Corrections({views.names[1]: (1.5, 1.0, 0.8)})
-        corrected = next(iter(Originals(posed, job.corrections).at(np.array([1]), shown, 1280)[1]))
+        plain = next(iter(Originals(posed, ready.corrections).at(np.array([1]), shown, 1280)[1]))
+        made = Corrections({views.names[1]: (1.5, 1.0, 0.8)})
+        corrected = next(iter(Originals(posed, made).at(np.array([1]), shown, 1280)[1]))
     assert np.array_equal(corrected, Tone((1.5, 1.0, 0.8)).undone(plain, TAKEN)[0])
     assert (corrected[..., 0] < plain[..., 0]).mean() > 0.9 and np.array_equal(corrected[..., 1], plain[..., 1])
 
 
 def test_a_mesh_is_made_of_pictures_as_they_were_taken_where_there_is_room(run: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    with open_job(run / "room", run / "other", gather(None, None, ["export.mesh_size=128"], image_size=48), make_progress(True)) as job:
-        _, _, posed, _, views = stand(job)
+    options = gather(None, None, ["export.mesh_size=128"], image_size=48)
+    with open_job(Place(run / "room", run / "other"), options, make_progress(True)) as job:
+        ready = prepare(job)
+        posed, views = ready.posed, ready.views
         train = np.flatnonzero(~views.test)
-        shown, cameras = Originals(posed, job.corrections).finer(views, train, job.settings.export)
+        shown, cameras = Originals(posed, ready.corrections).finer(views, train, job.settings.export)
         assert {picture.shape for picture in shown.images} == {(96, 128, 3)}
         assert {(camera.width, camera.height) for camera in cameras} == {(128, 96)}
         assert shown.names == [views.names[index] for index in train]
         monkeypatch.setattr("fieldfuse.memory.available", lambda: 130 * 2**20)
-        shown, cameras = Originals(posed, job.corrections).finer(views, train, job.settings.export)
+        shown, cameras = Originals(posed, ready.corrections).finer(views, train, job.settings.export)
         assert {picture.shape for picture in shown.images} == {(36, 48, 3)} and {camera.width for camera in cameras} == {48}
 
 

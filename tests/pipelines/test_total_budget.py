@@ -108,7 +108,7 @@ def fitted(seconds: float, formats: list[str] | None = None, spent: float = 10.0
     job = SimpleNamespace(settings=settings, stages=SimpleNamespace(cached={}, records={}))
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr("fieldfuse.pipelines.total_budget.finest", lambda *_: 512)
-        plan.choose_fit(job, None, None)  # type: ignore[arg-type]
+        plan.choose_fit(job, None)  # type: ignore[arg-type]
     return settings, plan
 
 

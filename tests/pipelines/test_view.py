@@ -16,7 +16,7 @@ import pytest
 
 from fieldfuse.camera import Array
 from fieldfuse.files import read_json
-from fieldfuse.pipelines.visitor import lens_of, pose_of
+from fieldfuse.pipelines.viewer import lens_of, pose_of
 from tests.evaluation.driven import driven, until
 from tests.pipelines.made import CAMERA, call, make_room
 from tests.pipelines.short import FAST, HUNG, finished, start

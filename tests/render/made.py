@@ -9,7 +9,7 @@ import torch
 from fieldfuse.evaluation.sphere import sphere_field
 from fieldfuse.nerfusion.decoder import make_decoder
 from fieldfuse.render.field import Field
-from fieldfuse.training.levels import all_places, first_field
+from fieldfuse.training.levels import NewField, all_places
 from fieldfuse.volume.host import TorchHost
 from fieldfuse.volume.space import Space
 
@@ -32,7 +32,7 @@ def random_field(
     net = make_decoder(decoder, channels, 16)
     for parameter in net.parameters():
         parameter.data.add_(0.2 * torch.randn(parameter.shape, generator=generator))
-    field = first_field(space, resolution, places, channels, raw, net, torch.tensor([0.2, 0.4, 0.6]), 0.0, 4, TorchHost(), generator)
+    field = NewField(space, resolution, net, torch.tensor([0.2, 0.4, 0.6])).on(places, TorchHost(), raw, generator)
     field.density_rows[:-1] += torch.randn(len(field.density_rows) - 1, generator=generator)
     field.feature_rows[:-1] += torch.randn(field.feature_rows[:-1].shape, generator=generator)
     return field

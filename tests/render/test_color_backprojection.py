@@ -16,9 +16,9 @@ from fieldfuse.evaluation.sphere import around, lens, sphere_field
 from fieldfuse.progress import Progress
 from fieldfuse.render.color_backprojection import BESIDE, COLOURS, MOST, STEEPEST, project_back, recoloured
 from fieldfuse.render.composite import SOLID, THRESHOLD
-from fieldfuse.render.differentiable import render_with_gradients
 from fieldfuse.render.field import Field
 from fieldfuse.render.image import render_view
+from fieldfuse.render.rays import render_with_gradients
 from fieldfuse.volume.lookup import corners
 from tests.render.made import random_field, random_rays
 

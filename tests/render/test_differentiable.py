@@ -7,9 +7,8 @@ from dataclasses import replace
 import pytest
 import torch
 
-from fieldfuse.render.differentiable import look_up, render_with_gradients
 from fieldfuse.render.field import Field
-from fieldfuse.render.rays import render_rays
+from fieldfuse.render.rays import differentiable_gather, render_rays, render_with_gradients
 from tests.render.made import random_field, random_rays
 
 
@@ -82,7 +81,7 @@ def test_lookup_gradient() -> None:
     weights = torch.rand((9, 8), generator=generator, dtype=torch.float64)
     for shape in ((12,), (12, 3)):
         values = torch.randn(shape, generator=generator, dtype=torch.float64, requires_grad=True)
-        assert torch.autograd.gradcheck(lambda v: look_up(v, rows, weights), (values,))
+        assert torch.autograd.gradcheck(lambda v: differentiable_gather(v, rows, weights), (values,))
 
 
 def test_a_threshold_drops_only_colours_of_faint_samples() -> None:

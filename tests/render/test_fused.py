@@ -16,10 +16,9 @@ from fieldfuse.nerfusion.cameras import Cameras
 from fieldfuse.nerfusion.cull import all_blocks
 from fieldfuse.nerfusion.lattice import LatentVolume, Lattice
 from fieldfuse.nerfusion.model import NerfusionModel
-from fieldfuse.render.differentiable import render_with_gradients
 from fieldfuse.render.field import Field
 from fieldfuse.render.fused import make_field, without_empty_blocks
-from fieldfuse.render.rays import render_rays
+from fieldfuse.render.rays import render_rays, render_with_gradients
 from fieldfuse.volume.space import Space
 from fieldfuse.volume.topology import Topology
 from tests.nerfusion.made import HEIGHT, INTRINSICS, WIDTH, lattice, small_model, wall_pictures

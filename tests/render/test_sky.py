@@ -22,7 +22,7 @@ from fieldfuse.render.bake_file import read_baked, write_baked
 from fieldfuse.render.field import Field
 from fieldfuse.render.image import render_view
 from fieldfuse.render.sky import on_sky, sky_colours
-from fieldfuse.training.behind import sky_behind
+from fieldfuse.training.background_sh import sky_behind
 from tests.render.made import random_field, random_rays
 
 CAMERA = Intrinsics(40, 30, 30.0, 30.0, 20.0, 15.0)

@@ -107,7 +107,7 @@ def struck(stage: str, number: int, times: int) -> Iterator[None]:
             os.kill(os.getpid(), number)
 
     def begin(self: ConsoleProgress, name: str) -> None:
-        self.stage = name
+        self.name = name
         if name == stage:
             strike()
 

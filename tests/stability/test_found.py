@@ -25,7 +25,7 @@ from fieldfuse.files import read_json, write_json
 from fieldfuse.nerfusion.training.settings import load_train_settings
 from fieldfuse.pipelines.console import ConsoleProgress
 from fieldfuse.pipelines.folder import RunFolder
-from fieldfuse.pipelines.stages import Stages
+from fieldfuse.pipelines.stages import Stage, Stages, StoredStage
 from fieldfuse.poses.scene import Scene
 from fieldfuse.render.bake import bake
 from fieldfuse.render.bake_file import METADATA_KEY, read_baked, write_baked
@@ -105,9 +105,8 @@ def test_a_stage_whose_file_rounds_answers_what_the_file_holds(tmp_path: Path) -
 
     with RunFolder(tmp_path) as folder:
         stages = Stages(folder, ConsoleProgress())
-        plain = stages.run("plain", lambda: 1 / 3, save, lambda: read_json(kept))
-        assert plain == 1 / 3
-        assert stages.run("rounded", lambda: 1 / 3, save, lambda: read_json(kept), rounded=True) == 0.3333333
+        assert stages.run(Stage("plain", lambda: 1 / 3, save, lambda: read_json(kept))) == 1 / 3
+        assert stages.run(StoredStage("rounded", lambda: 1 / 3, save, lambda: read_json(kept))) == 0.3333333
 
 
 def test_a_scene_between_no_depths() -> None:

@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from fieldfuse import memory, memory_limits
+from fieldfuse import memory
 from fieldfuse.camera import Similarity
 from fieldfuse.config import PosesSettings, TsdfSettings
 from fieldfuse.errors import InputError
@@ -98,7 +98,7 @@ def finished(tmp_path_factory: pytest.TempPathFactory) -> Path:
 def test_each_command_refuses_with_numbers_what_does_not_fit(name: str, finished: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     """With little memory as such, the first stage that reads anything refuses; here each command's own estimate is the one that does."""
     (command, *more), bytes_each, what = REFUSALS[name]
-    monkeypatch.setattr(memory_limits, bytes_each, HUGE)
+    monkeypatch.setattr(memory, bytes_each, HUGE)
     if name == "evaluate":  # scored once, it would only be read
         (finished / "stages" / "evaluate.json").unlink(missing_ok=True)
     answer = fieldfuse(command, finished, *more, "--threads", "1", "--quiet")
@@ -108,7 +108,7 @@ def test_each_command_refuses_with_numbers_what_does_not_fit(name: str, finished
 
 
 def test_an_export_leaves_out_the_meshes_that_do_not_fit_and_says_so(finished: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(memory_limits, "RENDER_BYTES", HUGE)
+    monkeypatch.setattr(memory, "RENDER_BYTES", HUGE)
     answer = fieldfuse("export", finished, "--formats", "obj,cameras", "--threads", "1", "--quiet", "--json")
     assert answer.code == 0, answer
     assert "points and meshes were left out: rendering 3 pictures" in answer.out and "GB is free" in answer.out

@@ -20,8 +20,9 @@ from numba.core.dispatcher import Dispatcher
 from fieldfuse.capture.types import Views
 from fieldfuse.stereo import transients
 from fieldfuse.training import depth_start, fit
+from fieldfuse.training.fit import Begin
 from fieldfuse.training.guided import fit_guided
-from fieldfuse.volume.grid_host import GridHost
+from fieldfuse.volume.grid import GridHost
 from tests.stereo.made import with_passer
 from tests.training.test_guided import SCENE, wanted
 
@@ -54,7 +55,7 @@ def missed(views: Views, decoder: str, host: GridHost | None) -> Kernels:
             before[0] = ready()
         return 0.02 * look
 
-    result = fit_guided(views, SCENE, wanted("budget=1", f"field.decoder={decoder}"), ticks=ticks, host=host)
+    result = fit_guided(views, SCENE, wanted("budget=1", f"field.decoder={decoder}"), begin=Begin(host), ticks=ticks)
     assert result.steps > 20 and result.field.resolution > 16  # it went from one level to the next
     assert views.background is not None or (result.left_out is not None and len(result.left_out.masks) > 0)
     return ready() - before[0]

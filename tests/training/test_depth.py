@@ -13,14 +13,13 @@ from fieldfuse.capture.types import Views
 from fieldfuse.config import FitSettings
 from fieldfuse.poses.scene import Scene
 from fieldfuse.render.image import render_view
-from fieldfuse.training.depth import FINE, REACH, ROUGH, Trust, depth_gradient, ray_distances
 from fieldfuse.training.fit import fit_field
-from fieldfuse.training.rays import PixelPool
+from fieldfuse.training.losses import FINE, REACH, ROUGH, Rates, Trust, depth_gradient
+from fieldfuse.training.pixels import PixelPool, ray_distances
 from fieldfuse.training.schedule import Schedule
-from fieldfuse.training.step import Rates
 from tests.poses.textured import arc, render
+from tests.training.gradients import made_views
 from tests.training.test_fit import ticking, wanted
-from tests.training.test_fused import made_views
 
 
 def test_distances_along_rays_are_those_of_the_pools_directions() -> None:
@@ -35,12 +34,6 @@ def test_distances_along_rays_are_those_of_the_pools_directions() -> None:
             continue
         along = (batch.directions[mine] @ torch.from_numpy(views.world_from_camera[index][:3, 2]).float()) * batch.distance[mine]
         np.testing.assert_allclose(along.numpy(), depth.reshape(-1), atol=1e-5)
-
-
-def test_without_depth_nothing_is_kept() -> None:
-    views = made_views()
-    assert PixelPool(views).take(torch.arange(3)).distance is None
-    assert PixelPool(replace(views, depths=[]), depth=True).take(torch.arange(3)).distance is None
 
 
 def test_what_is_no_depth_stays_unknown() -> None:

@@ -22,7 +22,7 @@ from fieldfuse.training.depth_start import (
     RESOLUTION_KNOWN,
     THICK,
     Votes,
-    _asked,
+    _voters,
     depth_start,
     measured,
     starts_by_depth,
@@ -185,13 +185,13 @@ def test_depth_that_leaves_nothing_is_not_believed() -> None:
         assert field.voxels > 1000 and torch.isfinite(field.density_rows).all() and torch.isfinite(field.feature_rows).all()
 
 
-def test_pictures_with_depth_are_asked_wherever_they_are() -> None:
+def test_pictures_with_depth_are_voters_wherever_they_are() -> None:
     made = views().subset(np.arange(200) % 7)
     depths = [one if index % 2 else None for index, one in enumerate(made.depths)]
-    asked = _asked(replace(made, depths=depths))
+    asked = _voters(replace(made, depths=depths))
     assert len(asked) == len(set(asked)) == 100 and sum(index % 2 for index in asked) == 50
     few = [one if index == 77 else None for index, one in enumerate(made.depths)]
-    assert 77 in _asked(replace(made, depths=few))
+    assert 77 in _voters(replace(made, depths=few))
 
 
 def test_held_out_pictures_are_not_looked_at() -> None:

@@ -9,8 +9,6 @@ import pytest
 import torch
 
 from fieldfuse.capture.types import Views
-from fieldfuse.errors import Interrupted
-from fieldfuse.progress import Progress
 from fieldfuse.render.color_backprojection import COLOURS, recoloured
 from fieldfuse.render.field import Field
 from fieldfuse.render.image import render_view
@@ -18,7 +16,7 @@ from fieldfuse.training import finer_colours as module
 from fieldfuse.training.finer_colours import PIXELS, finer_colours
 from fieldfuse.training.levels import finer
 from fieldfuse.volume.host import TorchHost
-from tests.render.test_recolour import DEPTH, decibel, grey, painted, pictures_of, stripes
+from tests.render.test_color_backprojection import DEPTH, decibel, grey, painted, pictures_of, stripes
 
 
 @pytest.fixture(scope="module")
@@ -92,15 +90,6 @@ def test_a_field_that_is_fine_enough_or_empty_keeps_its_lattice(coarse: Field, v
     assert fine.resolution == coarse.resolution and torch.equal(fine.topology.keys, coarse.topology.keys)
     empty = replace(coarse, occupied=torch.zeros_like(coarse.occupied))
     assert torch.equal(finer_colours(empty, views, DEPTH).feature_rows, empty.feature_rows)
-
-
-def test_it_can_be_stopped(coarse: Field, views: Views) -> None:
-    class Stop(Progress):
-        def stopping(self) -> bool:
-            return True
-
-    with pytest.raises(Interrupted):
-        finer_colours(coarse, views, DEPTH, Stop())
 
 
 def test_what_bulges_over_a_silhouette_goes(coarse: Field, views: Views) -> None:

@@ -14,10 +14,10 @@ from fieldfuse.config import Settings, load_settings
 from fieldfuse.poses.scene import Scene
 from fieldfuse.progress import Progress
 from fieldfuse.render.image import render_view
-from fieldfuse.training.fit import fit_field
+from fieldfuse.training.fit import Begin, fit_field
 from fieldfuse.training.levels import all_places, finer, looked_at, visible
 from fieldfuse.training.start import levels, make_space, possible
-from fieldfuse.volume.grid_host import GridHost
+from fieldfuse.volume.grid import GridHost
 
 SIZE = 40
 
@@ -74,7 +74,7 @@ def ticking(monkeypatch: pytest.MonkeyPatch, tick: float) -> dict[str, int]:
 @pytest.mark.parametrize("decoder", ["deferred", "per_sample"])
 def test_a_sphere_is_learnt(decoder: str, monkeypatch: pytest.MonkeyPatch) -> None:
     ticking(monkeypatch, 0.015)
-    result = fit_field(sphere_views(), scene(), wanted(f"decoder={decoder}"), host=GridHost())
+    result = fit_field(sphere_views(), scene(), wanted(f"decoder={decoder}"), begin=Begin(GridHost()))
     assert result.timeline[-1]["psnr"] > (21 if decoder == "deferred" else 19)  # an empty field scores 8.6
     assert result.timeline[-1]["psnr"] > result.timeline[0]["psnr"]
     views = sphere_views()
@@ -197,5 +197,5 @@ def test_coarse_levels_end_soon_where_no_validation_views_tell_that_they_gain_no
     progress = Progress()
     monkeypatch.setattr(progress, "update", note)
     late = (0.7, 0.8, 0.9)
-    result = fit_field(sphere_views(), scene(), wanted("budget=10"), progress, rungs=late)
+    result = fit_field(sphere_views(), scene(), wanted("budget=10"), progress, Begin(rungs=late))
     assert result.field.resolution == 64 and climbed[0] <= 2  # by `UNTOLD`, or as soon as a level has had time to grow, not by `late`

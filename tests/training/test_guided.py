@@ -20,7 +20,7 @@ from fieldfuse.render.field import Field
 from fieldfuse.render.image import make_renderer, render_view
 from fieldfuse.stereo import fast_mvs, transients
 from fieldfuse.training import depth_start
-from fieldfuse.training.fit import LEAST_VIEWS
+from fieldfuse.training.fit import LEAST_VIEWS, Begin
 from fieldfuse.training.guided import find_moving, fit_guided, looks_for_moving, wants_matching
 from tests.stereo.made import FAR, MEDIAN, NEAR, PASSED, corner, with_passer
 
@@ -115,19 +115,6 @@ def test_a_stop_while_looking_for_what_moves_ends_the_fit() -> None:
     assert result.interrupted and result.left_out is None and result.steps == 0
 
 
-def test_looking_for_what_moves_is_a_part_of_the_budget(monkeypatch: pytest.MonkeyPatch) -> None:
-    now, whole = steady(), transients.moving
-
-    def slow(*given: object, **options: object) -> object:
-        assert [now() for _ in range(100)]  # a second
-        return whole(*given, **options)  # type: ignore[arg-type]
-
-    monkeypatch.setattr(transients, "moving", slow)
-    result = fit_guided(replace(views(), depths=corner()[1]), SCENE, wanted(), ticks=now)
-    assert result.matched is None and result.left_out is not None and 1 <= result.left_out.seconds < 1.1
-    assert 3.9 < result.seconds < 4.2
-
-
 def test_what_moves_is_looked_for_where_depth_is_known_and_nothing_is_cut_out() -> None:
     known = replace(views(), depths=corner()[1])
     assert looks_for_moving(known, wanted()) and not looks_for_moving(known, wanted("fit.moving=off"))
@@ -195,7 +182,7 @@ def test_a_fit_begins_with_what_is_known_of_depth_within_its_budget(monkeypatch:
     result = fit_guided(measured, SCENE, wanted("fit.moving=off"), ticks=now)
     assert len(begun) == 1 and 3.9 < result.seconds < 4.2 and result.timeline[0]["seconds"] > 1
     assert depth_error(result.field) < 0.02
-    fit_guided(measured, SCENE, wanted("budget=1"), start=result.field, ticks=now)
+    fit_guided(measured, SCENE, wanted("budget=1"), begin=Begin(start=result.field), ticks=now)
     fit_guided(measured, SCENE, wanted("budget=1", "fit.depth=0"), ticks=now)
     fit_guided(views(), SCENE, wanted("budget=1"), ticks=now)  # six pictures were matched: too few
     assert len(begun) == 1
@@ -232,10 +219,10 @@ def test_a_guess_leaves_the_coarsest_lattice_sooner_where_validation_views_tell_
     many = few.subset(np.tile(np.arange(len(few)), -(-LEAST_VIEWS // np.count_nonzero(~few.test))))
     for shown, factor, tick in ((many, 0.7, 0.002), (few, 1.0, 0.005)):
         shares = []
-        for begin in ({}, {"start": rough, "coarse": True}):
+        for begin in (Begin(), Begin(start=rough, coarse=True)):
             told = Levels()
             settings = wanted("fit.depth_from=sensor", "fit.moving=off")
-            fit_guided(shown, SCENE, settings, told, ticks=steady(tick), **begin)  # type: ignore[arg-type]
+            fit_guided(shown, SCENE, settings, told, begin, steady(tick))
             assert set(told.seen) == {"32³", "64³"}
             shares.append(told.seen.count("32³") / len(told.seen))
         assert shares[1] <= factor * shares[0]

@@ -10,14 +10,12 @@ import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from fieldfuse.backends.numba.train_common import slow_near
-from fieldfuse.config import FitSettings
-from fieldfuse.training.near import slowness
-from fieldfuse.training.rays import PixelPool
-from fieldfuse.training.schedule import Schedule
+from fieldfuse.backends.numba.train_batch import near_scale
+from fieldfuse.training.losses import near_gradient_scaling
+from fieldfuse.training.pixels import PixelPool
 from tests.render.made import random_field
-from tests.training.gradients import torch_gradients
-from tests.training.test_fused import RATES, made_views
+from tests.training.gradients import made_views, torch_gradients
+from tests.training.test_numba import RATES
 
 BOUNDS = st.floats(0.0625, 100, width=32)
 DISTANCES = st.floats(-1, 1000, width=32)
@@ -26,15 +24,9 @@ DISTANCES = st.floats(-1, 1000, width=32)
 @settings(deadline=None)
 @given(distance=DISTANCES, within=BOUNDS)
 def test_both_engines_slow_a_sample_by_its_distance(distance, within):
-    factor = float(slowness(torch.tensor([distance]), within)[0])
+    factor = float(near_gradient_scaling(torch.tensor([distance]), within)[0])
     assert factor == pytest.approx(min(max(distance, 0) / within, 1) ** 2, abs=1e-6)
-    assert float(slow_near(np.float32(distance), np.float32(within))) == pytest.approx(factor, abs=1e-6)
-
-
-@settings(deadline=None)
-@given(distance=DISTANCES)
-def test_without_a_bound_nothing_is_slowed(distance):
-    assert float(slowness(torch.tensor([distance]), 0.0)[0]) == 1.0 == float(slow_near(np.float32(distance), np.float32(0)))
+    assert float(near_scale(np.float32(distance), np.float32(within))) == pytest.approx(factor, abs=1e-6)
 
 
 @pytest.mark.parametrize("decoder", ["deferred", "per_sample"])
@@ -48,8 +40,3 @@ def test_far_away_gradients_are_what_they_were(decoder):
         assert torch.equal(one, other)
     for one, other in zip(plain[:2], beyond[:2], strict=True):
         assert 0 < float(other.norm()) < 0.1 * float(one.norm())
-
-
-def test_the_schedule_hands_the_bound_on():
-    assert Schedule([32], 1.0, FitSettings(), True, slow_within=0.7).rates(0.0, 0).slow_within == 0.7
-    assert FitSettings().slow_within == 0.5

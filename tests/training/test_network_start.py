@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import itertools
 from dataclasses import replace
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -20,7 +19,7 @@ from fieldfuse.nerfusion.keyframes import KeyFrames
 from fieldfuse.poses.scene import Scene
 from fieldfuse.render.field import Field
 from fieldfuse.render.image import render_view
-from fieldfuse.training.fit import fit_field
+from fieldfuse.training.fit import Begin, fit_field
 from fieldfuse.training.from_network import (
     MEASURED_PIXELS,
     OBJECT_PIXELS,
@@ -28,7 +27,6 @@ from fieldfuse.training.from_network import (
     Inference,
     NetworkOptions,
     lattice_of,
-    load_networks,
     voxels_to_median,
 )
 from fieldfuse.training.network_start import THICK, THIN, network_start, widened
@@ -36,7 +34,7 @@ from fieldfuse.training.silhouettes import inside_silhouettes, visual_hull
 from fieldfuse.training.start import space_of
 from fieldfuse.volume.lookup import corners, gather
 from fieldfuse.volume.space import Space
-from tests.nerfusion.made import INTRINSICS, SMALL, small_model, wall_pictures
+from tests.nerfusion.made import INTRINSICS, small_model, wall_pictures
 
 DEPTH = 2.0
 
@@ -123,7 +121,7 @@ def test_a_fit_climbs_from_it() -> None:
     views, chosen = wall_views(), settings("field.resolution=96")
     start = network_start(made(), views, scene(), chosen)
     clock = itertools.count(0, 0.001)
-    result = fit_field(views, scene(), chosen, start=start, coarse=True, ticks=lambda: next(clock))
+    result = fit_field(views, scene(), chosen, begin=Begin(start=start, coarse=True), ticks=lambda: next(clock))
     assert result.field.resolution == 96 and result.steps > 500
     train = views.subset(np.flatnonzero(~views.test))
     before, after = (np.mean([error(field, train, i) for i in range(3)]) for field in (start, result.field))
@@ -198,20 +196,6 @@ def test_what_lies_outside_of_the_silhouettes_is_left_out() -> None:
         assert index == 0 or float(full[:, :left].mean()) > 0.8
     assert inside_silhouettes(running.field(finished=False), views).voxels == carved.voxels
     assert inside_silhouettes(carved, views).voxels == carved.voxels and inside_silhouettes(whole, views).voxels < 0.8 * whole.voxels
-
-
-def test_nothing_to_look_at_is_said() -> None:
-    views = wall_views()
-    views.test[:] = True
-    with pytest.raises(InputError, match="no training view"):
-        Inference(small_model(), views, scene(), KeyFrames(np.zeros(0, int), np.zeros((0, 0), int)))
-
-
-def test_networks_are_found(tmp_path: Path) -> None:
-    assert load_networks().config.features == 16
-    with pytest.raises(InputError, match="nowhere"):
-        load_networks(tmp_path / "nowhere.safetensors")
-    assert SMALL.features == 8
 
 
 def test_the_hull_holds_what_silhouettes_show_and_little_else() -> None:

@@ -14,15 +14,14 @@ import torch
 
 from fieldfuse.errors import InputError
 from fieldfuse.progress import SILENT
-from fieldfuse.training import guard, step
-from fieldfuse.training.adam import LazyAdam
-from fieldfuse.training.engine import Engine, TorchEngine, make_engine, warm_up
-from fieldfuse.training.finite import NotFiniteError, check
-from fieldfuse.training.fit import _first, fit_field
-from fieldfuse.training.numba_engine import NumbaOptimiser
-from fieldfuse.training.numba_per_sample import NumbaPerSampleOptimiser
-from fieldfuse.training.rays import PixelPool
-from fieldfuse.training.step import Rates
+from fieldfuse.training import nonfinite_policy, torch_engine
+from fieldfuse.training.engine import Engine, make_engine, warm_up
+from fieldfuse.training.fit import Begin, _first, fit_field
+from fieldfuse.training.losses import Rates
+from fieldfuse.training.nonfinite_policy import NotFiniteError, require_finite
+from fieldfuse.training.numba_engine import NumbaEngine
+from fieldfuse.training.pixels import PixelPool
+from fieldfuse.training.torch_engine import LazyAdam, TorchEngine
 from fieldfuse.volume.host import TorchHost
 from tests.training.test_fit import scene, sphere_views, ticking, wanted
 
@@ -35,11 +34,9 @@ def engine_of(name: str, decoder: str, threads: int = 1) -> Engine:
     settings = wanted(f"engine={name}", f"decoder={decoder}", "field.resolution=32")
     torch.manual_seed(0)
     views = sphere_views()
-    generator = torch.Generator().manual_seed(0)
-    field, _ = _first(views, views, scene(), settings, torch.device("cpu"), TorchHost(), generator)
+    field, _ = _first(views, scene(), settings, torch.device("cpu"), TorchHost())
     if name == "numba" and threads > 1:
-        kind = NumbaOptimiser if decoder == "deferred" else NumbaPerSampleOptimiser
-        return kind(field, PixelPool(views), 0, threads)
+        return NumbaEngine(field, PixelPool(views), 0, threads)
     return make_engine(settings, field, PixelPool(views))
 
 
@@ -51,14 +48,14 @@ def everything(engine: Any) -> list[np.ndarray]:
         out += [engine.density.state, engine.feature.state]
         out += [value for state in engine.decoder.state.values() for value in state.values()]
     else:
-        out += [engine.records, *(value for pair in engine.moments for value in pair)]
+        out += [engine.rows.records, *engine.first, *engine.second]
     return [np.array(value.detach() if isinstance(value, torch.Tensor) else value) for value in out]
 
 
 def spoiling(monkeypatch: pytest.MonkeyPatch, engine: str, value: float, when: Iterator[bool], what: str = "densities") -> None:
     """At the steps that `when` says, one gradient of a row, or of the decoder, is `value`."""
     if engine == "torch":
-        plain = step.scatter
+        plain = torch_engine.scatter
 
         def scatter(*given: Any) -> Any:
             rows, gradients = plain(*given)
@@ -66,16 +63,16 @@ def spoiling(monkeypatch: pytest.MonkeyPatch, engine: str, value: float, when: I
                 gradients[0 if what == "densities" else 1].view(-1)[5] = value
             return rows, gradients
 
-        monkeypatch.setattr(step, "scatter", scatter)
+        monkeypatch.setattr(torch_engine, "scatter", scatter)
         return
-    compiled = NumbaOptimiser._broken
+    compiled = NumbaEngine._broken
 
-    def broken(self: NumbaOptimiser, thread: int, error: float) -> str | None:
+    def broken(self: NumbaEngine, thread: int, error: float) -> str | None:
         if thread == self.threads - 1 and next(when):
-            (self.density_sums[thread] if what == "densities" else self.feature_sums[thread, 0])[5] = value
+            (self.rows.density[thread] if what == "densities" else self.rows.feature[thread, 0])[5] = value
         return compiled(self, thread, error)
 
-    monkeypatch.setattr(NumbaOptimiser, "_broken", broken)
+    monkeypatch.setattr(NumbaEngine, "_broken", broken)
 
 
 @pytest.mark.parametrize("value", [math.nan, -math.inf])
@@ -136,8 +133,9 @@ def test_a_fit_goes_on_from_the_last_good_step_with_smaller_ones(name: str, monk
     spoiling(monkeypatch, name, math.nan, (number in (10, 25) for number in count()))
     settings = wanted(f"engine={name}", "budget=3", "field.resolution=32")
     eased: list[float] = []
-    plain = guard.Guard.eased
-    monkeypatch.setattr(guard.Guard, "eased", lambda self, rates: (eased.append(self.slower), plain(self, rates))[1])
+    policy = nonfinite_policy.NonfinitePolicy
+    plain = policy.scaled_rates
+    monkeypatch.setattr(policy, "scaled_rates", lambda self, rates: (eased.append(self.slower), plain(self, rates))[1])
     result = fit_field(sphere_views(), scene(), settings)
     assert sorted(set(eased), reverse=True) == [1, 0.5, 0.25]
     assert len(result.notes) == 2 and result.steps == len(eased) - 2
@@ -155,7 +153,7 @@ def test_a_fit_that_breaks_again_and_again_ends_with_what_it_has(name: str, monk
     ticking(monkeypatch, 0.05)
     spoiling(monkeypatch, name, math.inf, (number >= 30 for number in count()))
     result = fit_field(sphere_views(), scene(), chosen)
-    assert result.steps == 30 and len(result.notes) == guard.MOST + 1
+    assert result.steps == 30 and len(result.notes) == nonfinite_policy.MOST + 1
     assert "the fit ended with the field of the step before" in result.notes[-1]
     assert bool(torch.isfinite(result.field.density_rows).all())
     assert result.timeline and math.isfinite(result.timeline[-1]["psnr"])
@@ -171,27 +169,27 @@ def test_going_on_from_a_broken_field_is_refused(monkeypatch: pytest.MonkeyPatch
     ticking(monkeypatch, 0.2)
     settings = wanted("engine=torch", "budget=2", "field.resolution=32")
     field = fit_field(sphere_views(), scene(), settings).field
-    again = fit_field(sphere_views(), scene(), settings, start=field)
+    again = fit_field(sphere_views(), scene(), settings, begin=Begin(start=field))
     assert not again.notes
     field.feature_rows[3, 2] = math.nan
     with pytest.raises(InputError, match="not finite; fit it anew"):
-        fit_field(sphere_views(), scene(), settings, start=field)
+        fit_field(sphere_views(), scene(), settings, begin=Begin(start=field))
 
 
 def test_going_on_from_a_field_of_no_voxel_is_refused() -> None:
     """As the networks leave it, where nothing could be recognised: no block, or blocks without a voxel."""
     views, settings = sphere_views(), wanted("engine=torch", "field.resolution=32")
-    made, _ = _first(views, views, scene(), settings, torch.device("cpu"), TorchHost(), torch.Generator().manual_seed(0))
-    for start in (empty := replace(made, occupied=torch.zeros_like(made.occupied)), empty.settled()):
+    made, _ = _first(views, scene(), settings, torch.device("cpu"), TorchHost())
+    for start in (empty := replace(made, occupied=torch.zeros_like(made.occupied)), empty.packed()()):
         with pytest.raises(InputError, match=r"holds no voxel, .* fit it anew with --init classical"):
-            fit_field(views, scene(), settings, start=start)
+            fit_field(views, scene(), settings, begin=Begin(start=start))
 
 
 def test_large_finite_gradients_are_no_bad_step() -> None:
     huge = torch.full((10,), 3e38)
-    check([("huge", huge)])  # whose sum is infinite
+    require_finite([("huge", huge)])  # whose sum is infinite
     with pytest.raises(NotFiniteError, match="the second is not finite at 2 of 10 places"):
-        check([("the first", huge), ("the second", torch.where(torch.arange(10) < 2, math.inf, huge))])
+        require_finite([("the first", huge), ("the second", torch.where(torch.arange(10) < 2, math.inf, huge))])
     rows = LazyAdam(torch.zeros(10))
     rows.step(torch.arange(10), huge, 0.1)
     assert bool(torch.isfinite(rows.values).all())
@@ -205,7 +203,7 @@ def test_features_that_overflow_in_the_decoder_end_in_a_sentence_or_in_numbers(n
     field = fit_field(sphere_views(), scene(), settings).field
     field.feature_rows[:-1] = torch.where(torch.arange(field.feature_rows.shape[1]) % 2 == 0, 3e38, -3e38)
     try:
-        after = fit_field(sphere_views(), scene(), settings, start=field).field
+        after = fit_field(sphere_views(), scene(), settings, begin=Begin(start=field)).field
     except InputError as error:
         assert "is not finite" in str(error)
         return

@@ -14,7 +14,7 @@ from fieldfuse.effects.correct import Corrections
 from fieldfuse.evaluation.score import score_views
 from fieldfuse.render.image import Rendered
 from fieldfuse.tone import Tone
-from fieldfuse.training.sample import Sample
+from fieldfuse.training.fit import Sample
 
 CAMERA = Intrinsics(40, 30, 40.0, 40.0, 20.0, 15.0)
 

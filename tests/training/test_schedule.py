@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 
+import numpy as np
 import pytest
 
 from fieldfuse.config import FitSettings, load_settings
-from fieldfuse.training.from_network import NetworkOptions
 from fieldfuse.training.schedule import (
     COARSE_GAIN,
     FINE_MOST,
@@ -21,7 +22,8 @@ from fieldfuse.training.schedule import (
     Schedule,
     most_rays,
 )
-from fieldfuse.training.start import FINER
+from fieldfuse.training.start import FINER, FINEST, PIXELS, USUAL, finest_resolution, space_of, worth_a_level
+from tests.training.test_fit import scene, sphere_views
 
 
 def plan() -> Schedule:
@@ -92,14 +94,6 @@ def test_few_views_bound_the_rays_and_many_do_not() -> None:
     assert most_rays(400_000, True, 50) == math.inf and most_rays(400_000, False, None) == math.inf
 
 
-def test_a_fit_ends_with_its_seconds_or_its_rays_whichever_are_spent_first() -> None:
-    free, bound = plan(), plan()
-    bound.most_rays = 1000
-    assert free.position(4.0, 10**9) == bound.position(4.0, 100) == 0.4
-    assert bound.position(4.0, 700) == 0.7 and bound.position(4.0, 1000) == 1
-    assert free.rays_left(4.0, 800) == pytest.approx(1200) and bound.rays_left(4.0, 800) == 200
-
-
 @pytest.mark.parametrize(("ladder", "rays"), [([32, 64], 256), ([64, 128], 512), ([480], 3840), ([1024], 4096), ([16], 256)])
 def test_rays_of_a_step_follow_from_the_lattice_wherever_a_fit_begins(ladder: list[int], rays: int) -> None:
     assert Schedule(ladder, 10.0, FitSettings(), True).rays == rays
@@ -121,10 +115,18 @@ def test_the_paper_prunes_and_splits_by_iterations() -> None:
     assert splits == [10_000, 20_000] and not prunings and schedule.steps == 25_000 and schedule.resolution == 512
 
 
-def test_the_papers_preset_has_none_of_the_extras() -> None:
-    settings = load_settings("paper")
-    network, fit = settings.network, settings.fit
-    assert (network.levels, network.gamma, network.agreement, network.recolour, network.depth_from) == (1, 0.6, False, False, "off")
-    assert (settings.keyframes.method, settings.field.decoder, settings.field.init) == ("uniform", "per_sample", "network")
-    assert not any((fit.distortion, fit.opacity, fit.slow_within, fit.depth, fit.soften)) and fit.depth_from == fit.moving == "off"
-    assert settings.effects.mode == "off" and NetworkOptions.of(network).gamma == 0.6
+@pytest.mark.parametrize(
+    ("asked", "given"), [(40, 64), (300, 288), (USUAL, USUAL), (1.3 * USUAL, USUAL), (1.6 * USUAL, 832), (FINEST, FINEST), (4000, FINEST)]
+)
+def test_a_lattice_is_as_fine_as_the_pictures_ask_for_within_bounds(asked: float, given: int) -> None:
+    views, around = replace(sphere_views(4), background=None), scene()
+    space = space_of(views, around)
+    focal = asked * PIXELS * around.median_depth / (2 * space.extent * space.half)
+    longer = replace(views, intrinsics=[replace(camera, fx=focal, fy=focal) for camera in views.intrinsics])
+    assert finest_resolution(space, longer, around) == given
+
+
+def test_what_is_little_finer_than_usual_is_no_level_of_its_own() -> None:
+    assert worth_a_level(USUAL) == worth_a_level(USUAL + 32) == worth_a_level(FINER - 1) == USUAL
+    assert worth_a_level(FINER) == FINER and worth_a_level(64) == 64
+    assert np.all(np.diff([worth_a_level(resolution) for resolution in range(64, 2 * FINEST, 32)]) >= 0)

@@ -11,7 +11,7 @@ import torch
 from fieldfuse.config import FitSettings
 from fieldfuse.training import fit
 from fieldfuse.training.fit import fit_field
-from fieldfuse.training.rays import PixelPool, softened
+from fieldfuse.training.pixels import PixelPool, softened
 from fieldfuse.training.schedule import LAST_SOFT, MOST_SOFT, Schedule
 from tests.training.test_fit import scene, sphere_views, ticking, wanted
 
@@ -28,15 +28,6 @@ def test_a_mean_is_that_of_a_gaussian(radius: float) -> None:
     mean = (weight[:, :, None] * image).sum((0, 1)) / weight.sum()
     assert np.abs(softened(image, None, radius)[y, x] - mean).max() < 4
     assert softened(image, None, 0.0) is image
-
-
-def test_what_is_masked_away_goes_into_no_mean() -> None:
-    image, valid = np.full((40, 60, 3), 100, np.uint8), np.ones((40, 60), bool)
-    image[:, 30:], valid[:, 30:] = 0, False
-    soft = softened(image, valid, 3.0)
-    assert (soft[valid] == 100).all() and (soft[~valid] == 0).all()
-    assert image[0, 59, 0] == 0  # what was given stays
-    assert softened(image, np.ones_like(valid), 3.0)[20, 29, 0] < 90
 
 
 @pytest.mark.parametrize("radius", [0.5, 1.0, 4.0])

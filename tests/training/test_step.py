@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import copy
 from dataclasses import replace
+from functools import partial
 
 import pytest
 import torch
@@ -11,13 +12,14 @@ import torch
 from fieldfuse.nerfusion.decoder import Deferred
 from fieldfuse.render.field import Field, density
 from fieldfuse.render.march import Samples, march
-from fieldfuse.training import step as step_module
-from fieldfuse.training.adam import LazyAdam
-from fieldfuse.training.depth import REACH
-from fieldfuse.training.rays import Batch
-from fieldfuse.training.step import Optimiser, Rates
+from fieldfuse.render.rays import shade
+from fieldfuse.training import torch_engine
+from fieldfuse.training.losses import REACH, Rates
+from fieldfuse.training.pixels import Batch, PixelPool
+from fieldfuse.training.torch_engine import LazyAdam, TorchEngine
 from fieldfuse.volume.lookup import corners
 from tests.render.made import random_field, random_rays
+from tests.training.gradients import made_views
 
 Tensor = torch.Tensor
 
@@ -70,7 +72,7 @@ def reference_loss(field: Field, samples: Samples, batch: Batch, rates: Rates, r
 @pytest.mark.parametrize(("shell", "slow"), [(0.0, False), (1.0, False), (1.0, True)])
 def test_gradients_match_autograd(decoder: str, shell: float, slow: bool, monkeypatch: pytest.MonkeyPatch) -> None:
     field = random_field(background=shell, resolution=16, decoder=decoder, raw=-2.0)
-    monkeypatch.setattr(step_module, "STOP", -1.0)
+    monkeypatch.setattr(torch_engine, "shade", partial(shade, stop=-1.0))
     origins, directions = random_rays(24)
     samples = march(field.grid, origins, directions, field.near, field.fine)
     generator = torch.Generator().manual_seed(1)
@@ -82,7 +84,7 @@ def test_gradients_match_autograd(decoder: str, shell: float, slow: bool, monkey
     batch = Batch(origins, directions, torch.rand(24, 3, generator=generator), torch.zeros(24, dtype=torch.int64), distance, weight)
     within = float(samples.distance.median()) if slow else 0.0
     rates = Rates(0.0, 0.0, 0.0, 0.01, 0.03, colour_threshold=-1.0, depth=0.05, slow_within=within)
-    monkeypatch.setattr(step_module, "march", lambda *arguments: samples)  # the same samples for both, without jitter
+    monkeypatch.setattr(torch_engine, "march", lambda *arguments: samples)  # the same samples for both, without jitter
     raw_rows = field.density_rows.double().requires_grad_(True)
     feature_rows = field.feature_rows.double().requires_grad_(True)
     exact = replace(field, decoder=copy.deepcopy(field.decoder).double())
@@ -90,11 +92,11 @@ def test_gradients_match_autograd(decoder: str, shell: float, slow: bool, monkey
     expected = [parameter.grad for parameter in exact.decoder.parameters() if parameter.grad is not None]
 
     caught: dict[str, tuple[Tensor, Tensor]] = {}
-    optimiser = Optimiser(field)
+    optimiser = TorchEngine(field, PixelPool(made_views()))
     monkeypatch.setattr(optimiser.density, "step", lambda rows, gradient, rate: caught.__setitem__("density", (rows, gradient)))
     monkeypatch.setattr(optimiser.feature, "step", lambda rows, gradient, rate: caught.__setitem__("feature", (rows, gradient)))
     monkeypatch.setattr(optimiser.decoder, "zero_grad", lambda: None)
-    optimiser.step(batch, rates, torch.Generator())
+    optimiser.step_on(batch, rates, torch.zeros(24))
     for name, reference in (("density", raw_rows.grad), ("feature", feature_rows.grad)):
         rows, gradient = caught[name]
         full = torch.zeros_like(field.density_rows if name == "density" else field.feature_rows)
@@ -132,6 +134,6 @@ def test_a_step_lowers_the_error() -> None:
     field = random_field(background=1.0, resolution=16, raw=-3.0)
     origins, directions = random_rays(256)
     batch = Batch(origins, directions, torch.full((256, 3), 0.7), torch.zeros(256, dtype=torch.int64))
-    optimiser, generator = Optimiser(field), torch.Generator().manual_seed(0)
-    errors = [optimiser.step(batch, Rates(0.1, 0.1, 3e-3, 0.001), generator)[0] for _ in range(40)]
+    engine, generator = TorchEngine(field, PixelPool(made_views())), torch.Generator().manual_seed(0)
+    errors = [engine.step_on(batch, Rates(0.1, 0.1, 3e-3, 0.001), torch.rand(256, generator=generator))[0] for _ in range(40)]
     assert errors[-1] < 0.1 * errors[0]

@@ -15,20 +15,19 @@ import torch
 
 from fieldfuse.render.field import Field
 from fieldfuse.render.rays import render_rays
-from fieldfuse.training.depth import ROUGH
-from fieldfuse.training.finite import NotFiniteError
-from fieldfuse.training.importance import TOP, Errors
-from fieldfuse.training.rays import PixelPool
-from fieldfuse.training.step import Optimiser, Rates
+from fieldfuse.training.losses import ROUGH, Rates
+from fieldfuse.training.nonfinite_policy import NotFiniteError
+from fieldfuse.training.pixels import TOP, PixelPool, TileErrors
+from fieldfuse.training.torch_engine import TorchEngine
 from tests.render.made import random_field, random_rays
-from tests.training.gradients import exact_gradients, weighed
-from tests.training.test_fused import made_views
+from tests.training.gradients import exact_gradients, made_views, weighed
 
 triton = pytest.importorskip("triton", reason="triton is not installed: it comes with torch for CUDA, and with `make test` on Linux")
 
-from fieldfuse.render.triton_renderer import Tables, TritonRenderer, bricks_to_skip  # noqa: E402
-from fieldfuse.training import triton_warm  # noqa: E402
-from fieldfuse.training.triton_engine import TritonOptimiser  # noqa: E402
+from fieldfuse.config import load_settings  # noqa: E402
+from fieldfuse.render.triton_renderer import TritonRenderer, bricks_to_skip  # noqa: E402
+from fieldfuse.training.engine import use_every_kernel  # noqa: E402
+from fieldfuse.training.triton_engine import TritonEngine  # noqa: E402
 
 DEVICE = torch.device("cuda" if torch.cuda.is_available() else "cpu")
 RATES = Rates(0.0, 0.0, 0.0, 0.01, 0.03, depth=0.05, slow_within=3.0, depth_noise=ROUGH.noise)
@@ -48,8 +47,8 @@ def field_of(shell: float, keep: float = 0.5, seed: int = 0, raw: float = -1.0) 
     return random_field(shell, 16, keep=keep, raw=raw, seed=seed)
 
 
-def engine_of(field: Field, views: object = None, **options: object) -> TritonOptimiser:
-    return TritonOptimiser(copy.deepcopy(field).to(DEVICE), PixelPool(views or made_views(), DEVICE, depth=True), **options)
+def engine_of(field: Field, views: object = None, **options: object) -> TritonEngine:
+    return TritonEngine(copy.deepcopy(field).to(DEVICE), PixelPool(views or made_views(), DEVICE, depth=True), **options)
 
 
 def picks(pool: PixelPool, seed: int = 0) -> torch.Tensor:
@@ -92,11 +91,12 @@ def test_steps_agree() -> None:
     """Two steps: rows, decoder, what was seen and how often, as the reference has them."""
     field, rates = field_of(1.0, raw=0.0), replace(RATES, density=0.02, feature=0.03, decoder=0.004)
     engine, start = engine_of(field), field.feature_rows.clone()
-    reference, pool = Optimiser(field), PixelPool(made_views(), depth=True)
+    pool = PixelPool(made_views(), depth=True)
+    reference = TorchEngine(field, pool)
     for seed in range(2):
         chosen = picks(pool, seed)
         jitter = torch.rand(RAYS, generator=torch.Generator().manual_seed(seed))
-        error, _ = reference.step(weighed(pool, chosen), rates, torch.Generator().manual_seed(seed))
+        error, _ = reference.step_on(weighed(pool, chosen), rates, jitter)
         assert engine.step_on(weighed(engine.pool, chosen.to(DEVICE)), rates, jitter.to(DEVICE)) == pytest.approx(error, rel=1e-4)
     assert float((field.feature_rows - start).abs().max()) > 0.03
     for wanted, got in zip([field.density_rows, field.feature_rows], [engine.field.density_rows, engine.field.feature_rows], strict=True):
@@ -117,10 +117,10 @@ def test_pixels_are_drawn_by_their_tiles_errors() -> None:
     pool.limit = int(pool.starts[2])
     engine.tile_density.copy_(torch.linspace(0.2, TOP, len(engine.tile_density)))
     every = pool.take(torch.arange(len(pool), device=DEVICE))
-    tiles = Errors(pool).tiles(torch.arange(len(pool), device=DEVICE))
+    tiles = TileErrors(pool).tiles(torch.arange(len(pool), device=DEVICE))
     rays = 256
     engine.limit.fill_(pool.limit)
-    engine._tell(RATES)
+    engine._stage(RATES)
     engine._room_for(rays)
     counts = torch.zeros(len(engine.tile_density))
     for step in range(2):
@@ -166,14 +166,6 @@ def test_what_is_not_finite_moves_nothing() -> None:
     assert not torch.equal(before[1], engine.field.feature_rows)
 
 
-def test_a_fit_that_cannot_begin_is_told_at_its_first_step() -> None:
-    """Later ones are looked at now and then; whether there was a good one at all decides what is said."""
-    engine = engine_of(field_of(0.0, raw=1.0))
-    engine.field.feature_rows[:-1] = float("nan")
-    with pytest.raises(NotFiniteError):
-        engine.step(RAYS, RATES)
-
-
 def test_the_skipped_distance_is_that_to_the_nearest_brick() -> None:
     bricks = torch.zeros(9, 9, 9, dtype=torch.bool)
     bricks[2, 3, 4] = bricks[7, 7, 1] = True
@@ -185,30 +177,12 @@ def test_the_skipped_distance_is_that_to_the_nearest_brick() -> None:
     assert torch.equal(bricks_to_skip(bricks).view(9, 9, 9), wanted.to(torch.uint8))
 
 
-def test_tables_follow_pruning() -> None:
-    field = field_of(0.0, keep=0.5)
-    tables, kept = Tables(field), field.occupied.clone()
-    kept[::2] = False
-    less = replace(field, occupied=kept)
-    tables.renew(less)
-    assert torch.equal(tables.occupied.bool(), kept) and torch.equal(tables.skip, bricks_to_skip(less.grid.bricks))
-
-
 def test_every_kernel_is_warmed_up(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Everything that a fit calls runs once, pruning and a finer lattice between, and leaves torch's random numbers alone."""
+    """Everything that a fit calls runs once, pruning and a finer lattice between."""
     if DEVICE.type == "cpu":
-        monkeypatch.setattr(triton_warm, "EAGER", -1)  # nothing is recorded here: one step instead of four
-    state = torch.get_rng_state()
-    updates: list[str] = []
-
-    class Told:
-        def update(self, done: float, total: float, note: str = "") -> None:
-            updates.append(note)
-
-    triton_warm.run(4, 8, DEVICE, Told())
-    assert len(updates) == 1 and torch.equal(state, torch.get_rng_state())
-    triton_warm.run(4, 8, DEVICE, Told())
-    assert len(updates) == 1
+        monkeypatch.setattr(TritonEngine, "EAGER", -1)  # nothing is recorded here: one step instead of four
+        monkeypatch.setattr("fieldfuse.training.engine.make_renderer", TritonRenderer)
+    use_every_kernel(TritonEngine, load_settings(pairs=["field.channels=4", "field.hidden=8"]), DEVICE, 32)
 
 
 @pytest.mark.skipif(sys.platform != "linux", reason="Triton compiles on Linux")

@@ -10,20 +10,17 @@ import torch
 
 from fieldfuse.config import FieldSettings
 from fieldfuse.effects.decide import choose_field
-from fieldfuse.nerfusion.decoder import Deferred, PerSample, make_decoder
+from fieldfuse.nerfusion.decoder import Deferred, PerSample
 from fieldfuse.training.fit import fit_field
-from fieldfuse.training.view import HARMONICS, blind, limit, of_direction
+from fieldfuse.training.start import HARMONICS, direction_weights, new_decoder, unseen_harmonics
 from tests.training.test_fit import scene, sphere_views, wanted
 
 
 def test_limits_take_the_harmonics_of_the_order() -> None:
     for kind in ("deferred", "per_sample"):
         for view, seen in (("none", 0), ("low", 4), ("full", 16)):
-            decoder = make_decoder(kind, 8, 16)
-            before = of_direction(decoder).clone()
-            limit(decoder, view)
-            assert blind(decoder).tolist() == [False] * seen + [True] * (16 - seen)
-            torch.testing.assert_close(of_direction(decoder)[:, :seen], before[:, :seen], rtol=0, atol=0)
+            decoder = new_decoder(FieldSettings(decoder=kind, channels=8, hidden=16, view=view))
+            assert unseen_harmonics(decoder).tolist() == [False] * seen + [True] * (16 - seen)
             assert HARMONICS[view] == seen
 
 
@@ -43,11 +40,11 @@ def test_a_fit_does_not_learn_what_it_may_not_see(engine: str, kind: str) -> Non
         fitted = fit_field(views, scene(), settings, ticks=lambda: 0.05 * next(looks))
         decoder = fitted.field.decoder
         assert fitted.steps > 5
-        assert int(blind(decoder).sum()) == 16 - HARMONICS[view]
+        assert int(unseen_harmonics(decoder).sum()) == 16 - HARMONICS[view]
         spread = colours(decoder, around).std(0).max()
         assert (spread < 1e-6) == (view == "none"), spread
         there, opposite = colours(decoder, around), colours(decoder, -around)
-        mixed = of_direction(decoder)[:, 4:].abs().max()
+        mixed = direction_weights(decoder)[:, 4:].abs().max()
         assert (mixed > 0) == (view == "full") and (view == "none" or not torch.allclose(there, opposite, atol=1e-6))
 
 

@@ -10,7 +10,7 @@ from pathlib import Path
 import pytest
 
 ROOT = Path(__file__).resolve().parents[2]
-TWICE = {"fieldfuse.backends.numba.march_per_sample._move"}  # rows of two kinds
+TWICE = {"fieldfuse.backends.numba.per_sample._move"}  # rows of two kinds
 
 
 @pytest.mark.parametrize("decoder", ["deferred", "per_sample"])

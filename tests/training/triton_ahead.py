@@ -13,8 +13,9 @@ import triton
 from triton.backends.compiler import GPUTarget
 from triton.compiler import ASTSource
 
-from fieldfuse.progress import SILENT
-from fieldfuse.training import triton_engine, triton_warm
+from fieldfuse.config import load_settings
+from fieldfuse.render.triton_renderer import TritonRenderer
+from fieldfuse.training import engine, triton_engine
 
 TYPES = {torch.float32: "*fp32", torch.int32: "*i32", torch.int64: "*i64", torch.uint8: "*u8"}
 CAPABILITY = 80
@@ -38,5 +39,7 @@ def compiled(self: Any, *args: Any, grid: Any, warmup: bool, num_warps: int = 4,
 if __name__ == "__main__":
     triton.runtime.jit.JITFunction.run = compiled
     triton_engine.ROWS["cpu"] = triton_engine.ROWS["cuda"]
-    triton_warm.run(16, 64, torch.device("cpu"), SILENT)
+    engine.make_renderer = TritonRenderer  # type: ignore[assignment]
+    settings = load_settings(pairs=["field.channels=16", "field.hidden=64"])
+    engine.use_every_kernel(triton_engine.TritonEngine, settings, torch.device("cpu"), 32)
     sys.stdout.write(" ".join(sorted({key[0] for key in done})) + f"\n{len(done)}\n")

@@ -2,23 +2,12 @@
 
 from __future__ import annotations
 
-import math
-
 import pytest
 import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from fieldfuse.volume.edit import (
-    corner_nodes,
-    dilate,
-    erase_empty_blocks,
-    prune,
-    resample,
-    split,
-    trilinear_density,
-    with_corner_blocks,
-)
+from fieldfuse.volume.edit import corner_nodes, dilate, erase_empty_blocks, pooled_in_torch, resample, split, with_corner_blocks
 from fieldfuse.volume.lookup import corners, gather
 from fieldfuse.volume.topology import VOXELS, Topology
 
@@ -68,11 +57,13 @@ def test_sets_against_dictionaries(seed: int, blocks: int, share: float) -> None
     topology, occupied = world(blocks, share, seed)
     cells = as_set(topology, occupied)
     assert as_set(topology, corner_nodes(topology, occupied)) == {p for cell in cells for p in cube_of(cell, 0, 1)}
+    assert torch.equal(pooled_in_torch(topology, occupied, 2), corner_nodes(topology, occupied))
     for steps in (0, 1, 2):
         grown_topology, grown = dilate(topology, occupied, steps)
         assert as_set(grown_topology, grown) == {p for cell in cells for p in cube_of(cell, -steps, steps)}
         assert torch.equal(grown_topology.keys[: topology.blocks], topology.keys)
         inside, kept = dilate(topology, occupied, steps, grow=False)
+        assert steps != 1 or torch.equal(pooled_in_torch(topology, occupied, 3), kept)
         assert inside is topology and as_set(topology, kept) == as_set(grown_topology, grown) & set(map(tuple, places(topology).tolist()))
 
 
@@ -96,40 +87,6 @@ def test_erase_empty_blocks_keeps_values_and_corner_blocks() -> None:
     used = corner_nodes(topology, occupied)
     assert torch.equal(one[:-1], torch.where(used, values[VOXELS : -1 - VOXELS], 0)) and float(one[-1]) == 0
     assert torch.equal(two, one[:, None].expand(-1, 3))
-
-
-# ------------------------------------------------------------------------------------------------ prune
-
-
-def test_prune_keeps_what_is_opaque_anywhere_inside() -> None:
-    topology, occupied = world(3, 0.1, 5)
-    density = torch.rand(topology.zero_row + 1, dtype=torch.float64) ** 4 * 40
-    density[-1] = 0
-    kept = prune(occupied, trilinear_density(topology, density), 0.05)
-    cells = occupied.nonzero().view(-1)
-    offsets = [(i + 0.5) / 3 for i in range(3)]
-    inside = torch.tensor([[x, y, z] for x in offsets for y in offsets for z in offsets], dtype=torch.float64)
-    for cell in cells.tolist():
-        rows, weights = corners(topology, torch.full((27,), cell), inside)
-        expected = min(math.exp(-float((density[rows[i].long()] * weights[i]).sum()) * 0.05) for i in range(27)) <= 0.6
-        assert bool(kept[cell]) == expected
-    assert not kept[~occupied].any() and 0 < int(kept.sum()) < len(cells)
-
-
-def test_prune_does_not_depend_on_the_unit_of_length_and_the_papers_rule_does() -> None:
-    topology, occupied = world(3, 0.1, 6)
-    density = torch.rand(topology.zero_row + 1) ** 4 * 10
-    results, papers = [], []
-    for scale in (1.0, 10.0, 1000.0):  # the same scene in metres, decimetres, millimetres
-        sigma = trilinear_density(topology, density / scale)
-        results.append(prune(occupied, sigma, 0.2 * scale))
-        papers.append(prune(occupied, sigma, 1.0))
-    assert torch.equal(results[0], results[1]) and torch.equal(results[0], results[2])
-    assert 0.1 < int(results[0].sum()) / int(occupied.sum()) < 0.99
-    assert int(papers[0].sum()) > 2 * int(papers[1].sum()) and not papers[2].any()
-
-
-# ------------------------------------------------------------------------------------------------ split and resample
 
 
 @settings(max_examples=10, deadline=None)
@@ -174,21 +131,6 @@ def test_borders_do_not_darken() -> None:
         assert int(hit.sum()) > 0 and bool((new[touched] > 0.99).all())
 
 
-def test_nearest_split_copies_the_lower_corner() -> None:
-    topology, occupied = world(2, 1.0, 2)
-    values = torch.randn(topology.zero_row + 1, 2)
-    values[-1] = 0
-    fine, fine_occupied, (new,) = split(topology, occupied, [values], mode="nearest")
-    rows = fine_occupied.nonzero().view(-1)
-    parent = places(fine)[rows] >> 1
-    slot, local = topology.find(parent >> 3), parent & 7
-    assert torch.equal(new[rows], values[slot * VOXELS + (local[:, 2] * 8 + local[:, 1]) * 8 + local[:, 0]])
-    thin = torch.zeros(VOXELS, dtype=torch.bool)
-    thin[0] = True
-    _, _, (edge,) = split(*with_corner_blocks(Topology(torch.tensor([[0, 0, 0]])), thin), [torch.ones(VOXELS + 1)], mode="nearest")
-    assert int((edge == 1).sum()) == 27, "the three corners along each axis of the halved voxel, none from values that mean nothing"
-
-
 @pytest.mark.parametrize("scale", [256 / 384, 0.5, 1.0, 1.5])
 def test_resample_reproduces_a_trilinear_function(scale: float) -> None:
     generator = torch.Generator().manual_seed(4)
@@ -204,26 +146,10 @@ def test_resample_reproduces_a_trilinear_function(scale: float) -> None:
     torch.testing.assert_close(several[:, 1], 2 * one, atol=1e-9, rtol=0)
 
 
-def test_resample_far_from_the_origin_and_sparse_keys() -> None:
-    keys = torch.tensor([[2**20, -(2**20), 7], [-(2**20), 2**20, -7]])
-    for cells in (2**26, 8):  # both ways of finding blocks
-        topology = Topology(keys, cells)
-        occupied = torch.ones(2 * VOXELS, dtype=torch.bool)
-        values = torch.arange(2 * VOXELS + 1.0)
-        values[-1] = 0
-        fine, _, (new,) = split(topology, occupied, [values])
-        rows = (places(fine) % 2 == 0).all(1) & (topology.find(places(fine) >> 4) >= 0)
-        parent = places(fine)[rows] >> 1
-        local = parent & 7
-        assert torch.equal(new[:-1][rows], values[topology.find(parent >> 3) * VOXELS + (local[:, 2] * 8 + local[:, 1]) * 8 + local[:, 0]])
-
-
 def test_nothing_in_nothing_out() -> None:
     empty = Topology(torch.zeros((0, 3), dtype=torch.int32))
     none = torch.zeros(0, dtype=torch.bool)
     topology, occupied, (values,) = split(empty, none, [torch.zeros(1, 3)])
     assert topology.blocks == 0 and len(occupied) == 0 and values.shape == (1, 3)
-    assert dilate(empty, none, 2)[0].blocks == 0 and len(prune(none, lambda cell, inside: inside[:, 0], 1.0)) == 0
+    assert dilate(empty, none, 2)[0].blocks == 0
     assert erase_empty_blocks(empty, none, [torch.zeros(1)])[0].blocks == 0
-    with pytest.raises(ValueError, match="mode"):
-        split(empty, none, [], mode="cubic")

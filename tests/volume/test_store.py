@@ -104,16 +104,6 @@ def test_compact_and_expand_are_inverse_on_stored_corners() -> None:
     assert torch.equal(compact(rows, data.node_index, torch.float16), rows[data.node_index.long()])
 
 
-def test_many_values_go_to_and_fro_in_parts(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(store, "AT_ONCE", 7)
-    data = make_field(6)
-    rows = expand(data.features.half(), data.node_index, len(data.keys))
-    assert torch.equal(compact(rows, data.node_index, torch.float16), data.features.half())
-    data.features[-1, 0] = torch.nan
-    with pytest.raises(OutputError, match="not finite"):
-        write_field(Path("never"), data)
-
-
 # ------------------------------------------------------------------------------------------------ tampering
 
 
@@ -183,20 +173,20 @@ BAD_INFORMATION: dict[str, tuple[dict[str, Any] | str, str]] = {
     "NaN in JSON": ('{"version": NaN}', "not valid JSON"),
     "a list": ("[]", "no version"),
     "nested": ("[" * 200_000, "not valid JSON"),
-    "huge number": ('{"version": ' + "9" * 10_000 + "}", "not valid JSON"),
-    "config": ({"config": []}, "incomplete"),
-    "meta": ({"meta": None}, "incomplete"),
-    "similarity": ({"working_from_input": 3}, "incomplete"),
-    "scale": ({"working_from_input": {**Similarity.identity().to_dict(), "scale": 0.0}}, "not positive"),
+    "huge number": ('{"version": ' + "9" * 10_000 + "}", "cannot be used"),
+    "config": ({"config": []}, "its config"),
+    "meta": ({"meta": None}, "its meta"),
+    "similarity": ({"working_from_input": 3}, "its working_from_input"),
+    "scale": ({"working_from_input": {**Similarity.identity().to_dict(), "scale": 0.0}}, "scale is not one .*greater than 0"),
     "mirror": ({"working_from_input": {**Similarity.identity().to_dict(), "rotation": [[1, 0, 0], [0, 1, 0], [0, 0, -1]]}}, "rotation"),
     "sheared": ({"working_from_input": {**Similarity.identity().to_dict(), "rotation": [[1, 1, 0], [0, 1, 0], [0, 0, 1]]}}, "rotation"),
-    "ragged": ({"working_from_input": {**Similarity.identity().to_dict(), "rotation": [[1, 1], [0, 1, 0], [0]]}}, "rotation|inhomogeneous"),
-    "voxel size": ({"voxel_size": -1}, "not positive"),
-    "voxel text": ({"voxel_size": "4"}, "voxel size is not made of"),
-    "voxel missing": ({"voxel_size": None}, "voxel size is not made of"),
-    "voxel size huge": ({"voxel_size": 10**400}, "too large|out of range"),
+    "ragged": ({"working_from_input": {**Similarity.identity().to_dict(), "rotation": [[1, 1], [0, 1, 0], [0]]}}, "rotation"),
+    "voxel size": ({"voxel_size": -1}, "voxel_size .*greater than 0"),
+    "voxel text": ({"voxel_size": "4"}, "its voxel_size is not one"),
+    "voxel missing": ({"voxel_size": None}, "its voxel_size is not one"),
+    "voxel size huge": ({"voxel_size": 10**400}, "voxel_size"),
     "origin": ({"origin": [1, 2]}, "origin"),
-    "far origin": ({"origin": [1, 2, 1e300]}, "origin is out of range"),
+    "far origin": ({"origin": [1, 2, 1e300]}, "its origin.2 is not one"),
 }
 
 
@@ -304,12 +294,6 @@ def test_values_beyond_half_precision_are_not_written_as_infinity(tmp_path: Path
     assert torch.equal(read_field(tmp_path / "f").features, large.features)  # kept in float32
     with pytest.raises(ValueError, match="float16 or float32"):
         write_field(tmp_path / "f", large, precision="int8")
-
-
-def test_unwritable_folder(tmp_path: Path) -> None:
-    (tmp_path / "file").write_text("")
-    with pytest.raises(OutputError, match="cannot write"):
-        write_field(tmp_path / "file" / "f", FIELD)
 
 
 def test_full_disk_is_said_and_leaves_nothing_behind(tmp_path: Path) -> None:

@@ -27,7 +27,7 @@ SH = (
     *(0.5900435899266435, 2.890611442640554, 0.4570457994644658, 0.3731763325901154, 1.445305721320277),
 )
 
-# Training: which pixels a step looks at (`training.importance`), and the depth term (`training.depth`).
+# Training: which pixels a step looks at (`training.pixels`), and the depth term (`training.losses`).
 TILE = 8  # pixels a side of what remembers an error
 SHARE = 0.8  # S, of the density that goes by errors
 MOST = 4.0  # M, most that an error counts, in means

@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from fieldfuse.checked import checked, nearest
+from fieldfuse.config import checked, nearest
 from fieldfuse.effects import models, scenery
 from fieldfuse.errors import InputError, brief
 

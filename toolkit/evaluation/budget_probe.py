@@ -88,10 +88,10 @@ def _ray() -> Piece:
 
 
 def _fit() -> Piece:
-    from fieldfuse.training.numba_engine import NumbaOptimiser
-    from fieldfuse.training.step import Rates
+    from fieldfuse.training.losses import Rates
+    from fieldfuse.training.numba_engine import NumbaEngine
 
-    engine, rates = NumbaOptimiser(sphere_field(SIDE), sphere_pixels(), 0), Rates(0.01, 0.01, 0.001, 0.01, 0.01)
+    engine, rates = NumbaEngine(sphere_field(SIDE), sphere_pixels(), 0), Rates(0.01, 0.01, 0.001, 0.01, 0.01)
     return lambda: engine.step(RAYS, rates), float(RAYS)
 
 

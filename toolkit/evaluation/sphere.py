@@ -13,8 +13,8 @@ from fieldfuse.nerfusion.decoder import make_decoder
 from fieldfuse.render.composite import UNITS
 from fieldfuse.render.field import Field
 from fieldfuse.render.paths import look_at
-from fieldfuse.training.levels import all_places, first_field
-from fieldfuse.training.rays import PixelPool
+from fieldfuse.training.levels import NewField, all_places
+from fieldfuse.training.pixels import PixelPool
 from fieldfuse.volume.host import TorchHost
 from fieldfuse.volume.space import Space
 
@@ -36,7 +36,7 @@ def sphere_field(resolution: int, seed: int = 0) -> Field:
     distance = ((places.float() + 0.5) * voxel - 1).norm(dim=1)
     places = places[(distance - RADIUS).abs() < THICK * voxel]
     raw = math.log(0.5 / (UNITS * voxel))
-    field = first_field(space, resolution, places, CHANNELS, raw, decoder, torch.zeros(3), 0.0, 4, TorchHost(), generator)
+    field = NewField(space, resolution, decoder, torch.zeros(3)).on(places, TorchHost(), raw, generator)
     field.feature_rows[:-1] += torch.randn(field.feature_rows[:-1].shape, generator=generator)
     return field
 

@@ -15,7 +15,7 @@ from fieldfuse.camera import Array, Intrinsics
 from fieldfuse.capture.types import Capture, Views
 from fieldfuse.config import ExportSettings, Settings
 from fieldfuse.errors import InputError
-from fieldfuse.memory_limits import PICTURE_BYTES, SURFACE_BYTES, pixels, require_pictures
+from fieldfuse.memory import PICTURE_BYTES, SURFACE_BYTES, pixels, require_pictures
 from fieldfuse.progress import SILENT, Progress
 
 if TYPE_CHECKING:

@@ -10,8 +10,8 @@ import numpy as np
 import torch
 
 from fieldfuse.backends.numba import common as K
-from fieldfuse.backends.numba.mark_views import mark_pass
-from fieldfuse.backends.numba.render_rays import chessboard_distance
+from fieldfuse.backends.numba.march import mark_pass
+from fieldfuse.backends.numba.volume import chessboard_distance
 from fieldfuse.camera import Intrinsics
 from fieldfuse.errors import InputError
 from fieldfuse.nerfusion.decoder import Deferred
@@ -20,8 +20,7 @@ from fieldfuse.render.composite import RAW_MAX, STOP, UNITS
 from fieldfuse.render.field import Field
 from fieldfuse.render.numba_renderer import FARTHEST, decoder_arrays, make_space, make_volume
 from fieldfuse.threads import share
-from fieldfuse.volume.compiled import dilated
-from fieldfuse.volume.edit import corner_nodes, erase_empty_blocks, with_corner_blocks
+from fieldfuse.volume.edit import corner_nodes, dilate, erase_empty_blocks, with_corner_blocks
 from fieldfuse.volume.space import Space
 from fieldfuse.volume.topology import VOXELS, Topology
 
@@ -166,7 +165,6 @@ def bake(field: Field, keep: torch.Tensor | None = None) -> BakedField:
     if field.voxels == 0:
         raise InputError("the field holds no voxel that training views see, so there is nothing to bake; fit it for longer")
     topology = field.topology
-    assert topology.table is not None
     occupied = field.occupied.numpy().reshape(-1, VOXELS)
     occupied = occupied[: int(occupied.any(1).sum())]  # the blocks behind them only lend corners
     first, rows, base, total = counted(occupied)
@@ -280,4 +278,4 @@ def seen_voxels(
     share(part, range(threads), threads)
     progress.check()
     weight = torch.from_numpy((marks.max(0) >> 4).astype(np.float32) / 4095)
-    return (weight > least) | (dilated(field.topology, weight > max(FIRM, least)) & field.occupied)
+    return (weight > least) | (dilate(field.topology, weight > max(FIRM, least), 1, grow=False)[1] & field.occupied)

@@ -21,8 +21,8 @@ from fieldfuse.capture.types import Views
 from fieldfuse.nerfusion.decoder import Deferred
 from fieldfuse.progress import SILENT, Progress
 from fieldfuse.render.composite import SOLID, STOP, THRESHOLD, ray_sum
-from fieldfuse.render.differentiable import render_with_gradients
 from fieldfuse.render.field import Field
+from fieldfuse.render.rays import render_with_gradients
 from fieldfuse.threads import share
 from fieldfuse.volume.lookup import corners, scatter
 
@@ -165,17 +165,17 @@ class _Compiled:
         self.marks = np.zeros((self.threads, len(field.occupied)), np.uint16)
 
     def add(self, origins: Tensor, directions: Tensor, colours: Tensor) -> None:
-        from fieldfuse.backends.numba.color_backprojection import project_back_pass
         from fieldfuse.backends.numba.decode import rays_of
+        from fieldfuse.backends.numba.render import project_back_pass
 
         given = [values.float().contiguous().numpy() for values in (origins, directions, colours)]
-        limits = [np.float32(value) for value in (STOP, THRESHOLD, STEEPEST, MOST)]
+        limits = tuple(np.float32(value) for value in (STOP, THRESHOLD, STEEPEST, MOST))
         edges = np.linspace(0, len(origins), self.threads + 1).astype(int)
 
         def part(thread: int) -> None:
             own = [values[edges[thread] : edges[thread + 1]] for values in given]
             field = (self.space, self.volume, self.layers, rays_of(self.layers))
-            project_back_pass(*field, *own, *limits, self.marks[thread], self.total[thread])
+            project_back_pass(*field, *own, limits, self.marks[thread], self.total[thread])
 
         share(part, range(self.threads), self.threads)
 

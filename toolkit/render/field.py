@@ -43,8 +43,8 @@ class Field:
         decoder: deferred or per sample.
         background: (3,) colour behind everything.
         near: distance before which nothing is sampled.
-        sky: (9, 3) harmonics of the colour behind everything, which whole pictures show instead of `background`; None: there is none. It
-            stays on the CPU, where pictures are put together.
+        sky: (9, 3) harmonics of the colour behind everything, which whole renders show instead of `background`; None: there is none. It
+            stays on the CPU, where renders are put together.
     """
 
     space: Space
@@ -103,8 +103,8 @@ class Field:
 
     def packed(self) -> Callable[[], Field]:
         """What makes the copy that `settled` is; it holds the corners that voxels use and nothing else, so that the memory of this field's
-        rows can be let go of before the copy's is taken: the end of a fit is when most is needed."""
-        corners = self._corners().view(-1, VOXELS)
+        rows can be freed before the copy's is taken: the end of a fit is when most is needed."""
+        corners = corner_nodes(self.topology, self.occupied).view(-1, VOXELS)
         kept = corners.any(1).nonzero().view(-1)
         source = corners.view(-1).nonzero().view(-1)
         density, feature = self.density_rows.detach()[source], self.feature_rows.detach()[source]
@@ -114,21 +114,13 @@ class Field:
         rest = replace(self, topology=topology, occupied=occupied, density_rows=none[0], feature_rows=none[1])
         return lambda: replace(rest, density_rows=expand(density, index, blocks), feature_rows=expand(feature, index, blocks))
 
-    def _corners(self) -> torch.Tensor:
-        """(M · 512,) bool: lattice corners that voxels use."""
-        if self.device.type == "cpu":
-            from fieldfuse.volume import compiled
-
-            return compiled.corner_nodes(self.topology, self.occupied)
-        return corner_nodes(self.topology, self.occupied)
-
     def save(self, path: Path | str, working_from_input: Similarity | None = None, meta: dict[str, Any] | None = None) -> None:
         """Write `field.safetensors`, atomically; corners that no occupied voxel uses are left out.
 
         Raises:
             OutputError: it cannot be written.
         """
-        nodes = self._corners().nonzero().squeeze(1)
+        nodes = corner_nodes(self.topology, self.occupied).nonzero().squeeze(1)
         decoder = "deferred" if isinstance(self.decoder, Deferred) else "per_sample"
         config = {
             "space": self.space.to_dict(),

@@ -1,4 +1,4 @@
-"""Whole pictures of a field: colour, depth along z and opacity at a camera."""
+"""Whole renders of a field: colour, depth along z and opacity at a camera."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ SOLID = 0.5  # depth is given where at least this much of the light is stopped
 
 @dataclass(frozen=True)
 class Rendered:
-    """A picture: `rgb` (H, W, 3) float32 in [0, 1], `depth` (H, W) float32 along z in working units (0 = none), `opacity` (H, W)
+    """A render: `rgb` (H, W, 3) float32 in [0, 1], `depth` (H, W) float32 along z in working units (0 = none), `opacity` (H, W)
     float32."""
 
     rgb: Array
@@ -37,23 +37,21 @@ class View(Protocol):
 
 
 def make_renderer(field: Field, engine: str = "auto") -> View:
-    """What renders rays of `field`, for many pictures: compiled on the CPU and, where a ray is decoded once, on CUDA; torch elsewhere.
+    """What renders rays of `field`, for many renders: compiled on the CPU and, where a ray is decoded once, on CUDA; torch elsewhere.
 
     Args:
         engine: auto | numba | triton | torch. Numba runs on the CPU alone, Triton on CUDA alone.
     """
-    deferred = isinstance(field.decoder, Deferred)
-    chosen = choose_engine(engine, "deferred" if deferred else "per_sample", field.device)
+    chosen = choose_engine(engine, "deferred" if isinstance(field.decoder, Deferred) else "per_sample", field.device)
     if chosen == "triton":
         from fieldfuse.render.triton_renderer import TritonRenderer
 
         return TritonRenderer(field)
     if chosen == "torch":
         return partial(_in_chunks, field)
-    from fieldfuse.render.numba_per_sample import PerSampleRenderer
     from fieldfuse.render.numba_renderer import NumbaRenderer
 
-    compiled = NumbaRenderer(field) if deferred else PerSampleRenderer(field)
+    compiled = NumbaRenderer(field)
 
     def render(origins: torch.Tensor, directions: torch.Tensor) -> RayValues:
         values = compiled.render(origins, directions)
@@ -63,7 +61,7 @@ def make_renderer(field: Field, engine: str = "auto") -> View:
 
 
 def _in_chunks(field: Field, origins: torch.Tensor, directions: torch.Tensor) -> RayValues:
-    """Torch keeps every sample of a batch in memory, so a picture is taken piece by piece."""
+    """Torch keeps every sample of a batch in memory, so a render is made piece by piece."""
     parts = [
         render_rays(field, o.to(field.device), d.to(field.device))
         for o, d in zip(origins.split(CHUNK), directions.split(CHUNK), strict=True)

@@ -38,9 +38,8 @@ class Samples:
     def __len__(self) -> int:
         return len(self.ray)
 
-    def keep(self, mask: Tensor) -> Samples:
-        """The samples where `mask` (samples,) is true, with `first` renewed."""
-        kept = mask.nonzero().squeeze(1)
+    def take(self, kept: Tensor) -> Samples:
+        """The samples of the ascending indices `kept`, with `first` renewed."""
         ray = self.ray[kept]
         values = (self.distance, self.span, self.length, self.place, self.cell, self.inside)
         return Samples(ray, first_of_ray(ray), *(value[kept] for value in values))
@@ -56,7 +55,7 @@ def first_of_ray(ray: Tensor) -> Tensor:
 
 
 class MarchGrid:
-    """What a ray needs to know of a volume: its space, its lattice, which blocks and which voxels hold something.
+    """What a ray needs of a volume: its space, its lattice, which blocks and which voxels hold something.
 
     Args:
         space: region of interest and contraction.
@@ -66,8 +65,6 @@ class MarchGrid:
     """
 
     def __init__(self, space: Space, resolution: int, topology: Topology, occupied: Tensor) -> None:
-        if topology.table is None:
-            raise ValueError("the march needs the dense block table")
         self.space, self.resolution, self.topology, self.occupied = space, resolution, topology, occupied
         self.voxel = 2 * space.extent / resolution
         self._table = topology.table.reshape(-1)

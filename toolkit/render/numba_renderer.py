@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 import torch
 
 from fieldfuse.backends.numba import common as K
-from fieldfuse.backends.numba.decode import layers_of, rays_of
-from fieldfuse.backends.numba.render_rays import chessboard_distance, render_pass
+from fieldfuse.backends.numba import decode, per_sample, render
+from fieldfuse.backends.numba.volume import chessboard_distance
 from fieldfuse.nerfusion.decoder import Deferred
 from fieldfuse.render.composite import STOP, THRESHOLD
 from fieldfuse.render.field import Field
@@ -33,53 +35,52 @@ def make_space(field: Field) -> K.Space:
     cx, cy, cz = (f(c) for c in space.centre)
     bx, by, bz = (f(b) for b in space.box)
     ox, oy, oz = (int(c) for c in field.topology.table_origin)
-    channels = field.feature_rows.shape[1]
-    return K.Space(
-        *(cx, cy, cz, f(space.half), f(space.shell), f(space.extent), bx, by, bz),
-        voxel=f(field.grid.voxel),
-        near=f(field.near),
-        fine=int(field.fine),
-        resolution=int(field.resolution),
-        ox=ox,
-        oy=oy,
-        oz=oz,
-        width=(0,) * channels,
-    )
+    size = (f(field.grid.voxel), f(field.near), int(field.fine), int(field.resolution))
+    width = (0,) * field.feature_rows.shape[1]
+    return K.Space(cx, cy, cz, f(space.half), f(space.shell), f(space.extent), bx, by, bz, *size, ox, oy, oz, width)
 
 
 def make_volume(field: Field) -> K.Volume:
     """The field's arrays; densities and features are the field's own memory, so what a fit changes is seen here at once."""
     topology = field.topology
-    assert topology.table is not None
     upper = topology.around[:, [13, 14, 16, 17, 22, 23, 25, 26]]
     upper = torch.where(upper < 0, topology.blocks, upper).to(torch.int32).contiguous()
     bricks = np.where(field.grid.bricks.numpy() > 0, np.uint8(0), np.uint8(FARTHEST))
     chessboard_distance(bricks, FARTHEST)
     bits = np.packbits(field.occupied.numpy().reshape(-1, VOXELS), axis=1, bitorder="little").view(np.uint64)
-    return K.Volume(
-        topology.table.numpy(), bricks, bits, upper.numpy(), field.density_rows.detach().numpy(), field.feature_rows.detach().numpy()
-    )
+    rows = field.density_rows.detach().numpy(), field.feature_rows.detach().numpy()
+    return K.Volume(topology.table.numpy(), bricks, bits, upper.numpy(), *rows)
 
 
 class NumbaRenderer:
-    """Renders rays of one field (CPU, deferred decoder); makes the kernels' arrays once."""
+    """Renders rays of one field on the CPU; makes the kernels' arrays once.
 
-    def __init__(self, field: Field, threads: int | None = None) -> None:
-        assert isinstance(field.decoder, Deferred)
-        self.space, self.volume, self.layers = make_space(field), make_volume(field), layers_of(decoder_arrays(field.decoder))
-        self.background = field.background.numpy().astype(np.float32)
+    Args:
+        weights: the decoder's as the kernels have them (`decode.Layers` or `per_sample.Net`), which stay the caller's; None: a copy.
+    """
+
+    def __init__(self, field: Field, threads: int | None = None, weights: decode.Layers | per_sample.Net | None = None) -> None:
+        self.space, self.volume, self.background = make_space(field), make_volume(field), field.background.numpy().astype(np.float32)
         self.threads = threads or torch.get_num_threads()
+        self.weights: Any
+        self._pass: Any
+        self._room: Any
+        if isinstance(field.decoder, Deferred):
+            self.weights = weights or decode.layers_of(decoder_arrays(field.decoder))
+            self._pass, self._room, self.threshold = render.render_pass, decode.rays_of, THRESHOLD
+        else:
+            self.weights = weights or per_sample.net_of(field.decoder)
+            self._pass, self._room, self.threshold = per_sample.render_pass, per_sample.make_tape, per_sample.NEGLIGIBLE
 
-    def render(self, origins: Tensor, directions: Tensor, threshold: float = THRESHOLD) -> Tensor:
+    def render(self, origins: Tensor, directions: Tensor) -> Tensor:
         """(B, 3), (B, 3) → (B, 5): colour, distance, opacity. The same whatever the number of threads."""
         out = np.empty((len(origins), 5), np.float32)
-        given = origins.float().contiguous().numpy(), directions.float().contiguous().numpy()
+        lines = origins.float().contiguous().numpy(), directions.float().contiguous().numpy()
+        fixed, limits = (self.space, self.volume, self.weights), (np.float32(STOP), np.float32(self.threshold))
 
         def part(piece: slice) -> None:
-            arguments = (given[0][piece], given[1][piece], np.float32(STOP), np.float32(threshold), out[piece])
-            render_pass(self.space, self.volume, self.layers, rays_of(self.layers), self.background, *arguments)
+            self._pass(*fixed, self._room(self.weights), self.background, lines[0][piece], lines[1][piece], *limits, out[piece])
 
         size = max(min(PIECE, len(out) // self.threads), 1)
-        pieces = [slice(start, start + size) for start in range(0, len(out), size)]
-        share(part, pieces, self.threads)
+        share(part, [slice(start, start + size) for start in range(0, len(out), size)], self.threads)
         return torch.from_numpy(out)

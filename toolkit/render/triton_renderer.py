@@ -1,4 +1,4 @@
-"""A field on CUDA as its kernels read it, and pictures of it."""
+"""A field on CUDA as its kernels read it, and renders of it."""
 
 from __future__ import annotations
 
@@ -15,17 +15,16 @@ from fieldfuse.render.rays import RayValues
 
 Tensor = torch.Tensor
 FARTHEST = 24  # bricks that are skipped at once, at most
-CHUNK = 65536  # rays of a picture at a time …
+CHUNK = 65536  # rays of a render at a time …
 SLOTS = 192  # … and samples of each that can show: the weights of so many exceed the threshold in thin fog alone, whose rest hardly shows
-THRESHOLD = 1e-3  # of weights that show in pictures, as in `rays.render_rays`
+THRESHOLD = 1e-3  # of weights that show in renders, as in `rays.render_rays`
 
 
 class Tables:
-    """What `backends.triton.march.walk` asks of a field. The tensors stay where they are when voxels are pruned (`renew`)."""
+    """What `backends.triton.march.walk` reads of a field. The tensors stay where they are when voxels are pruned (`renew`)."""
 
     def __init__(self, field: Field) -> None:
         space, topology = field.space, field.topology
-        assert topology.table is not None
         self.table, self.lookup = topology.table.view(-1), topology.lookup_rows.reshape(-1)
         self.occupied, self.skip = field.occupied.to(torch.uint8), bricks_to_skip(field.grid.bricks)
         self.shell, self.fine = space.shell > 0, field.fine
@@ -56,7 +55,7 @@ def launch_walk(
     field: Field, tables: Tables, buffers: tuple[Tensor, ...], marks: tuple[Tensor, Tensor], count: int, threshold: float, slots: int
 ) -> None:
     """Walk along the first `count` rays of `buffers` (rays, cells, notes, counts, sums). With marks (`seen`, `visits`) of no voxel it is a
-    picture's walk, else a training step's."""
+    render's walk, else a training step's."""
     train = len(marks[0]) > 0
     walk[(triton.cdiv(count, RAYS),)](
         *buffers,

@@ -15,7 +15,7 @@ from pydantic import Field
 from scipy.spatial.transform import Rotation
 
 from fieldfuse.camera import Array
-from fieldfuse.checked import nearest
+from fieldfuse.config import nearest
 from fieldfuse.errors import InputError
 from fieldfuse.simulate.eye import Scenery
 

@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from fieldfuse.camera import Array
-from fieldfuse.checked import nearest
+from fieldfuse.config import nearest
 from fieldfuse.effects.scenery import Background, Highlights
 from fieldfuse.errors import InputError
 from fieldfuse.simulate import furniture

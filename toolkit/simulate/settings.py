@@ -11,7 +11,7 @@ import numpy as np
 from pydantic import Field
 
 from fieldfuse.camera import Intrinsics
-from fieldfuse.checked import checked, one_of, read_yaml
+from fieldfuse.config import checked, one_of, read_yaml
 from fieldfuse.errors import InputError
 from fieldfuse.simulate.paths import PathSettings
 

@@ -1,7 +1,7 @@
-"""The start of a fit whose pictures' depth is known, measured or matched: which voxels can hold something, how thick, in which colour.
+"""The start of a fit whose images' depth is known, measured or matched: which voxels can hold something, how thick, in which colour.
 
-The classical start (`start.py`) goes by depth only where next to no picture contradicts it, on the coarsest lattice. Here pictures vote,
-voxel by voxel: what more than a few of them saw past is empty, what they measured is thick and has its colour, and what nobody knows stays
+The classical start (`start.py`) goes by depth only where next to no image contradicts it, on the coarsest lattice. Here images vote,
+voxel by voxel: what more than a few of them saw past is empty, what they measured is thick and has its colour, and what is unknown stays
 as thin and grey as in the classical start. So a fit begins on a finer lattice, and has more of its rays left for the finest.
 Not in the paper.
 """
@@ -10,14 +10,13 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-import numba
 import numpy as np
 import torch
 
+from fieldfuse.backends.numba.volume import add_points, vote
 from fieldfuse.camera import Array, invert, unproject
 from fieldfuse.capture.types import Views
 from fieldfuse.config import Settings
-from fieldfuse.nerfusion.decoder import make_decoder
 from fieldfuse.poses.scene import Scene
 from fieldfuse.render.field import Field
 from fieldfuse.training.levels import FEATURE_NOISE, all_places, occupancy
@@ -30,54 +29,54 @@ from fieldfuse.training.start import (
     colour_behind,
     finest_resolution,
     levels,
+    new_decoder,
     possible,
     radii,
     space_of,
 )
-from fieldfuse.training.view import limit
 from fieldfuse.volume.space import Space
 from fieldfuse.volume.topology import BLOCK, Topology
 
 Tensor = torch.Tensor
-RESOLUTION = 64  # voxels a side, where a part of the pictures' depth is known …
-KNOWN, RESOLUTION_KNOWN = 0.9, 128  # … and where that much of it is: what nobody knows is found on coarse lattices
+RESOLUTION = 64  # voxels a side, where a part of the images' depth is known …
+KNOWN, RESOLUTION_KNOWN = 0.9, 128  # … and where that much of it is: what is unknown is found on coarse lattices
 THICK = 1.5  # raw density of what was measured
-MOST_VIEWS = 80  # pictures with depth that are asked, and as many without, evenly spread: more say the same
-PIECE = 4096  # voxels of the coarsest lattice whose parts are asked for at a time: memory is bounded
+MOST_VIEWS = 80  # images with depth that vote, and as many without, evenly spread: more agree with these
+PIECE = 4096  # voxels of the coarsest lattice whose parts are voted on at a time: memory is bounded
 MOST_POINTS = 1_000_000  # that are put onto the lattice
 ENOUGH = 1.0  # points that a corner needs about it to count as measured
-PAST, PAST_SHARE = 1, 0.05  # pictures, and share of those that know, that may see past what is not empty
-SURFACE = 0.2  # pictures that measured a surface, for each one that saw past it, where it stays all the same
+PAST, PAST_SHARE = 1, 0.05  # images, and share of those with depth, that may see past what is not empty
+SURFACE = 0.2  # images that measured a surface, for each one that saw past it, where it stays all the same
 
 
 @dataclass(frozen=True)
 class Votes:
-    """What pictures say of voxels; those that have a surface before a voxel say nothing of it."""
+    """Votes of images on voxels; those that have a surface before a voxel have none on it."""
 
-    unknown: Array  # (N,) int32 pictures that look there, and know no depth
+    unknown: Array  # (N,) int32 images that look there, without depth
     past: Array  # (N,) … that measured something farther away
     here: Array  # (N,) … that measured a surface there
 
     def stays(self, views: int) -> Array:
-        """(N,) bool: the voxels that can hold something, by the votes of so many pictures."""
+        """(N,) bool: the voxels that can hold something, by the votes of so many images."""
         least = 2 if views >= FEW_VIEWS else 1
         surface = (self.here >= least) & (self.here > SURFACE * self.past)
-        told = self.unknown + self.past + self.here
-        empty = self.past > np.maximum(PAST, PAST_SHARE * told)
+        votes = self.unknown + self.past + self.here
+        empty = self.past > np.maximum(PAST, PAST_SHARE * votes)
         seen = self.unknown + self.here > 0
         return np.asarray(surface | (seen & ~empty))
 
 
 def starts_by_depth(views: Views, settings: Settings) -> bool:
     """Whether a fit of these views begins so: depth is known and believed, and alpha cuts nothing out. Depth that was matched has to be
-    that of `FEW_VIEWS` training pictures: what few agree on is too often wrong (gum with 12 pictures lost 1.1 dB by it)."""
-    told = sum(depth is not None and not test for depth, test in zip(views.depths, views.test, strict=False))
-    return told >= (FEW_VIEWS if views.matched else 1) and settings.fit.depth > 0 and views.background is None
+    that of `FEW_VIEWS` training images: what few agree on is too often wrong (gum with 12 images lost 1.1 dB by it)."""
+    known = sum(depth is not None and not test for depth, test in zip(views.depths, views.test, strict=False))
+    return known >= (FEW_VIEWS if views.matched else 1) and settings.fit.depth > 0 and views.background is None
 
 
 def depth_start(views: Views, scene: Scene, settings: Settings, device: torch.device | str = "cpu") -> Field:
     """The first field of a fit, at `RESOLUTION` voxels a side, or at `RESOLUTION_KNOWN` where nearly all depth is known (at the fit's
-    finest, when that is less), from the training pictures and their depth. About a second.
+    finest, when that is less), from the training images and their depth. About a second.
 
     Args:
         views: all views, at least one training view with depth; held-out ones are not looked at.
@@ -86,7 +85,7 @@ def depth_start(views: Views, scene: Scene, settings: Settings, device: torch.de
     train = views.subset(np.flatnonzero(~np.asarray(views.test)))
     space = space_of(views, scene, settings.field.background)
     resolution = _resolution(space, train, scene, settings)
-    some = train.subset(_asked(train))
+    some = train.subset(_voters(train))
     coarse, ratio = possible(space, COARSEST, all_places(space, COARSEST), train), resolution // COARSEST
     kept = []
     for part in coarse.split(PIECE):
@@ -103,13 +102,12 @@ def depth_start(views: Views, scene: Scene, settings: Settings, device: torch.de
     feature[known, :3] = torch.logit((colour[known] / count[known, None]).clamp(0.02, 0.98))
     density = torch.where(known, THICK, THIN)
     density[-1], feature[-1] = 0, 0
-    decoder = make_decoder(settings.field.decoder, channels, settings.field.width)
-    limit(decoder, settings.field.view)
+    decoder = new_decoder(settings.field)
     return Field(space, resolution, topology, occupied, density, feature, decoder, colour_behind(views), NEAR * scene.near).to(device)
 
 
 def votes(space: Space, resolution: int, places: Tensor, views: Views) -> Votes:
-    """What the depth of `views` says of the voxels `places` (N, 3)."""
+    """Votes of the depth of `views` on the voxels `places` (N, 3)."""
     # Also writeable: numba compiles kernels anew for arrays that are not.
     centres, radius = (np.require(one, requirements=("C", "W")) for one in radii(space, resolution, places, WHOLE))
     worlds = np.stack([invert(pose) for pose in views.world_from_camera])
@@ -118,7 +116,7 @@ def votes(space: Space, resolution: int, places: Tensor, views: Views) -> Votes:
     for index, depth in enumerate(views.depths):
         camera = views.intrinsics[index]
         known = np.zeros((camera.height, camera.width), np.float32) if depth is None else np.ascontiguousarray(depth, dtype=np.float32)
-        _vote(centres, radius, cameras[index], worlds[index], known, out)
+        vote(centres, radius, cameras[index], worlds[index], known, out)
     return Votes(*out)
 
 
@@ -127,13 +125,13 @@ def measured(space: Space, resolution: int, topology: Topology, views: Views) ->
     colours, each channel 0 … 1: (M · 512 + 1,) and (M · 512 + 1, 3) float32, nothing in the zero row."""
     side = BLOCK * (resolution // BLOCK + 1)
     whole = np.zeros((side, side, side, 4), np.float32)
-    asked = [index for index, depth in enumerate(views.depths) if depth is not None]
-    pixels = sum(views.images[index][..., 0].size for index in asked)
+    deep = [index for index, depth in enumerate(views.depths) if depth is not None]
+    pixels = sum(views.images[index][..., 0].size for index in deep)
     step = max(1, int(np.ceil(np.sqrt(pixels / MOST_POINTS))))
-    for index in asked:
+    for index in deep:
         points, colours = _points(views, index, step)
         at = (space.contract(space.normalise(torch.from_numpy(points))) + space.extent) * (resolution / (2 * space.extent))
-        _add(at.clamp(-1, side).numpy().astype(np.float32), colours, whole)
+        add_points(at.clamp(-1, side).numpy().astype(np.float32), colours, whole)
     blocks = whole.reshape(side // BLOCK, BLOCK, side // BLOCK, BLOCK, side // BLOCK, BLOCK, 4).transpose(0, 2, 4, 1, 3, 5, 6)
     x, y, z = topology.keys.long().unbind(1)
     rows = torch.from_numpy(blocks)[z, y, x].reshape(-1, 4)
@@ -144,8 +142,8 @@ def measured(space: Space, resolution: int, topology: Topology, views: Views) ->
 def warm_up() -> None:
     """Have the kernels compiled, or loaded."""
     out = np.zeros((3, 1), np.int32)
-    _vote(np.zeros((1, 3)), np.ones(1), np.ones(4), np.eye(4), np.zeros((1, 1), np.float32), out)
-    _add(np.zeros((1, 3), np.float32), np.zeros((1, 3), np.uint8), np.zeros((2, 2, 2, 4), np.float32))
+    vote(np.zeros((1, 3)), np.ones(1), np.ones(4), np.eye(4), np.zeros((1, 1), np.float32), out)
+    add_points(np.zeros((1, 3), np.float32), np.zeros((1, 3), np.uint8), np.zeros((2, 2, 2, 4), np.float32))
 
 
 def _resolution(space: Space, train: Views, scene: Scene, settings: Settings) -> int:
@@ -156,10 +154,10 @@ def _resolution(space: Space, train: Views, scene: Scene, settings: Settings) ->
     return max((rung for rung in rungs if rung <= wanted and rung & (rung - 1) == 0), default=COARSEST)
 
 
-def _asked(train: Views) -> Array:
-    """Indices of the pictures that vote."""
-    told = np.array([depth is not None for depth in train.depths])
-    return np.concatenate([some[:: max(1, -(-len(some) // MOST_VIEWS))] for some in (np.flatnonzero(told), np.flatnonzero(~told))])
+def _voters(train: Views) -> Array:
+    """Indices of the images that vote."""
+    deep = np.array([depth is not None for depth in train.depths])
+    return np.concatenate([some[:: max(1, -(-len(some) // MOST_VIEWS))] for some in (np.flatnonzero(deep), np.flatnonzero(~deep))])
 
 
 def _split(places: Tensor, ratio: int) -> Tensor:
@@ -180,45 +178,3 @@ def _points(views: Views, index: int, step: int) -> tuple[Array, Array]:
     pixels = np.stack([column, row], 1) + 0.5
     points = unproject(views.intrinsics[index], views.world_from_camera[index], pixels, depth[row, column].astype(np.float64))
     return points, views.images[index][row, column]
-
-
-@numba.njit(cache=True, nogil=True)
-def _vote(centres: Array, radius: Array, camera: Array, world: Array, depth: Array, out: Array) -> None:
-    """Add what one picture says of voxels to out (3, N): unknown, past, here."""
-    fx, fy, cx, cy = camera
-    height, width = depth.shape
-    for i in range(len(centres)):
-        x, y, z = centres[i]
-        far = world[2, 0] * x + world[2, 1] * y + world[2, 2] * z + world[2, 3]
-        reach = 2 * radius[i]
-        if far <= reach:
-            continue
-        u = (world[0, 0] * x + world[0, 1] * y + world[0, 2] * z + world[0, 3]) / far * fx + cx
-        v = (world[1, 0] * x + world[1, 1] * y + world[1, 2] * z + world[1, 3]) / far * fy + cy
-        if not (0 <= u < width and 0 <= v < height):
-            continue
-        there = depth[int(v), int(u)]
-        if not there > 0:
-            out[0, i] += 1
-        elif far < there - reach:
-            out[1, i] += 1
-        elif far <= there + reach:
-            out[2, i] += 1
-
-
-@numba.njit(cache=True, nogil=True)
-def _add(places: Array, colours: Array, out: Array) -> None:
-    """Add points (P, 3), in voxels, to the corners about them, out (z, y, x, 4): weight, and colours by it."""
-    high, long, wide = out.shape[0] - 1, out.shape[1] - 1, out.shape[2] - 1
-    for i in range(len(places)):
-        x, y, z = places[i]
-        if not (0 <= x < wide and 0 <= y < long and 0 <= z < high):
-            continue
-        left, top, front = int(x), int(y), int(z)
-        for corner in range(8):
-            dx, dy, dz = corner & 1, (corner >> 1) & 1, corner >> 2
-            weight = abs(1 - dx - (x - left)) * abs(1 - dy - (y - top)) * abs(1 - dz - (z - front))
-            node = out[front + dz, top + dy, left + dx]
-            node[0] += weight
-            for channel in range(3):
-                node[channel + 1] += weight * colours[i, channel]

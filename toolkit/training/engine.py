@@ -1,4 +1,4 @@
-"""Three engines, one field: what a fit asks of each, and which one it gets.
+"""Three engines, one field: what a fit needs of each, and which one it gets.
 
 `torch` is the reference and runs everywhere; `numba` is the fast path of the CPU, `triton` that of CUDA. They agree in values and gradients
 (tests compare them), not in the random numbers that they draw.
@@ -6,23 +6,30 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
+from collections.abc import Callable
 from typing import Protocol
 
+import numpy as np
 import torch
 
 from fieldfuse.backends.dispatch import choose_engine
+from fieldfuse.camera import Intrinsics
+from fieldfuse.capture.types import Views
 from fieldfuse.config import Settings
-from fieldfuse.nerfusion.decoder import Deferred
 from fieldfuse.progress import Progress
 from fieldfuse.render.field import Field
-from fieldfuse.render.rays import render_rays
-from fieldfuse.training.adam import LazyAdam
-from fieldfuse.training.importance import Errors
-from fieldfuse.training.rays import PixelPool
-from fieldfuse.training.step import Optimiser, Rates
+from fieldfuse.render.image import make_renderer
+from fieldfuse.training.levels import NewField, all_places, finer, visible
+from fieldfuse.training.losses import Rates
+from fieldfuse.training.pixels import PixelPool
+from fieldfuse.training.start import new_decoder
+from fieldfuse.training.torch_engine import TorchEngine
+from fieldfuse.volume.compiled import finer_blocks
+from fieldfuse.volume.host import TorchHost
+from fieldfuse.volume.space import Space
 
 Tensor = torch.Tensor
+_ready: set[tuple[object, ...]] = set()  # what kernels were made ready for in this process
 
 
 class Engine(Protocol):
@@ -44,19 +51,23 @@ class Engine(Protocol):
         ...
 
     def step(self, rays: int, rates: Rates) -> tuple[float, int]:
-        """One step on `rays` random pixels → mean squared colour error, samples looked up."""
+        """One step on `rays` random pixels → mean squared colour error, samples looked up.
+
+        Raises:
+            NotFiniteError: the loss or a gradient is not finite; nothing was moved.
+        """
         ...
 
     def renew_rows(self, field: Field) -> None:
-        """Go on with another field of the same decoder; the rows' state starts afresh."""
+        """Go on with another field of the same decoder: the rows' state starts afresh, the decoder's stays."""
         ...
 
-    def let_go(self) -> None:
+    def release(self) -> None:
         """Free what belongs to the rows, before finer ones are made beside them; `renew_rows` must follow."""
         ...
 
     def go_on_with(self, field: Field) -> None:
-        """Go on with the same rows after pruning."""
+        """Go on with the same rows after pruning; what was seen counts half from now on, so that it is forgotten within a few prunings."""
         ...
 
     def colours(self, origins: Tensor, directions: Tensor) -> Tensor:
@@ -68,29 +79,7 @@ class Engine(Protocol):
         ...
 
 
-class TorchEngine(Optimiser):
-    """The reference, on any device."""
-
-    def __init__(self, field: Field, pool: PixelPool, seed: int) -> None:
-        self.pool, self.generator, self.drawn_by = pool, torch.Generator().manual_seed(seed), Errors(pool)
-        super().__init__(field)
-
-    def step(self, rays: int, rates: Rates) -> tuple[float, int]:  # type: ignore[override]
-        picks, weight = self.drawn_by.draw(rays, self.generator)
-        out = super().step(replace(self.pool.take(picks), weight=weight), rates, self.generator)
-        self.drawn_by.remember(picks, self.errors)
-        return out
-
-    def colours(self, origins: Tensor, directions: Tensor) -> Tensor:
-        return render_rays(self.field, origins, directions).colour
-
-    def let_go(self) -> None:
-        nothing = torch.zeros(0)
-        self.density, self.feature = LazyAdam(nothing), LazyAdam(nothing)
-        self.seen = self.visits = nothing
-
-    def sync(self) -> Field:
-        return self.field
+Make = Callable[[Field, PixelPool, int], Engine]
 
 
 def chosen_engine(settings: Settings, device: torch.device) -> str:
@@ -99,21 +88,21 @@ def chosen_engine(settings: Settings, device: torch.device) -> str:
 
 
 def make_engine(settings: Settings, field: Field, pool: PixelPool) -> Engine:
-    """The engine that the settings ask for, or for `auto` the fastest that there is."""
-    chosen = chosen_engine(settings, field.device)
-    if chosen == "torch":
-        return TorchEngine(field, pool, settings.seed)
+    """The engine of the settings, or for `auto` the fastest that there is."""
+    return _kind(chosen_engine(settings, field.device))(field, pool, settings.seed)
+
+
+def _kind(chosen: str) -> Make:
+    """The class of an engine; its kernels are imported with it."""
+    if chosen == "numba":
+        from fieldfuse.training.numba_engine import NumbaEngine
+
+        return NumbaEngine
     if chosen == "triton":
-        from fieldfuse.training.triton_engine import TritonOptimiser
+        from fieldfuse.training.triton_engine import TritonEngine
 
-        return TritonOptimiser(field, pool, settings.seed)
-    if isinstance(field.decoder, Deferred):
-        from fieldfuse.training.numba_engine import NumbaOptimiser
-
-        return NumbaOptimiser(field, pool, settings.seed)
-    from fieldfuse.training.numba_per_sample import NumbaPerSampleOptimiser
-
-    return NumbaPerSampleOptimiser(field, pool, settings.seed)
+        return TritonEngine
+    return TorchEngine
 
 
 def fit_device(settings: Settings) -> torch.device:
@@ -122,19 +111,42 @@ def fit_device(settings: Settings) -> torch.device:
 
 
 def warm_up(settings: Settings, progress: Progress) -> None:
-    """Have the kernels compiled (once a machine: they are kept on disk) or loaded, before any clock runs."""
+    """Have the kernels compiled (once a machine: they are cached on disk) or loaded, before any clock runs. The random numbers of the
+    process stay as they were."""
     chosen = chosen_engine(settings, device := fit_device(settings))
     if chosen == "torch":
         torch.optim.Adam([torch.zeros(1, requires_grad=True)])  # the first optimiser imports torch's compiler: 1.6 s
         return
-    if chosen == "triton":
-        from fieldfuse.training import triton_warm
-
-        triton_warm.run(settings.field.channels, settings.field.width, device, progress)
-        return
-    from fieldfuse.training import numba_warm as warm
-
-    kind = (settings.field.decoder, settings.field.channels, settings.field.width)
-    if not warm.ready(*kind):
+    kind = (settings.field.decoder, settings.field.channels, settings.field.width, device)
+    if kind not in _ready:
         progress.update(0, 1, "compiling the fast engine, once on this machine, about half a minute")
-        warm.run(*kind)
+        state = torch.get_rng_state()
+        use_every_kernel(_kind(chosen), settings, device, 32 if chosen == "triton" else 8)
+        torch.set_rng_state(state)
+        _ready.add(kind)
+
+
+def use_every_kernel(kind: Make, settings: Settings, device: torch.device, rays: int) -> None:
+    """Everything that a fit and its renders call, on a field of a few voxels: with and without a background beyond the region of interest,
+    known depth and masks, where kernels differ by these."""
+    rates, host = Rates(0.01, 0.01, 0.001, 0.01, 0.01), TorchHost(device)
+    pose = np.eye(4)
+    pose[2, 3] = -3
+    for known in (False, True):
+        space = Space((0.0, 0.0, 0.0), 1.0, 1.0 if known else 0.0)
+        field = NewField(space, 8, new_decoder(settings.field).to(device), torch.zeros(3, device=device)).on(all_places(space, 8), host)
+        for masked in (False, True):
+            valid = np.ones((4, 4), bool)
+            valid[0, 0] = not masked
+            one = Views(["one"], [np.zeros((4, 4, 3), np.uint8)], [Intrinsics(4, 4, 4, 4, 2, 2)], pose[None], np.zeros(1, bool), [valid])
+            one.depths = [np.ones((4, 4), np.float32) if known else None]
+            engine = kind(field, PixelPool(one, device, depth=known), 0)
+            for _ in range(getattr(kind, "EAGER", 0) + 2 if known and masked else 1):  # the last two are recorded and replayed
+                engine.step(rays, rates)
+        finer_blocks(field.topology, field.occupied, 2.0)
+        field = finer(field, visible(field, engine.seen, engine.visits, 0.05), 16, host)
+        engine.renew_rows(field)
+        engine.step(rays, rates)
+        engine.go_on_with(field)
+        engine.colours(torch.zeros(3, 3), torch.eye(3))
+        make_renderer(engine.sync())(torch.zeros(3, 3), torch.eye(3))

@@ -1,4 +1,4 @@
-"""Colours finer than the shape they lie on: the networks' field, its colours looked up in the pictures on ever finer lattices.
+"""Colours finer than the shape they lie on: the networks' field, its colours looked up in the images on ever finer lattices.
 
 The networks work on voxels of some pixels, since sparse convolutions cost most of direct inference. Shape is smooth at that scale, colours
 are not, and to look them up (`render.color_backprojection`) costs little at any scale. So voxels that the images see are divided, which
@@ -25,10 +25,10 @@ from fieldfuse.volume.topology import BLOCK
 
 Tensor = torch.Tensor
 PIXELS = 1.5  # of the training views that a voxel at the median depth spans in the end …
-PIXELS_WITHIN = 1.0  # … and where they have alpha, which tells edges of shape as finely
+PIXELS_WITHIN = 1.0  # … and where they have alpha, which shows edges of shape as finely
 MOST_VOXELS = 3_000_000
 MOST_RESOLUTION = 1024  # voxels along a side: what a ray needs to skip empty space is an array over all of the lattice
-VOXEL_BYTES = 500  # at the worst: rows of half-empty blocks, those that replace them, sums of what rays ask for
+VOXEL_BYTES = 500  # at the worst: rows of half-empty blocks, those that replace them, sums over rays
 SEEN = 0.02  # weight T·α below which no ray sees a voxel: it hides behind others, and is not divided
 RELAXATION = 1.6  # of each back-projection: one is worth as much as two without
 SILHOUETTE = 0.5  # voxels about a voxel's middle in which alpha must show nothing for it to go: what bulges over a silhouette costs most
@@ -41,7 +41,7 @@ def finer_colours(field: Field, views: Views, depth: float, progress: Progress =
     """A field of about the same densities whose colours were looked up again on ever finer lattices, each at most twice as fine as the one
     before, until a voxel spans `PIXELS`, or with alpha `PIXELS_WITHIN`; on the last of them twice.
 
-    Voxels that no ray of the pictures saw, nor lie beside one that a ray saw, are dropped on the way.
+    Voxels that no ray of the images saw, nor lie beside one that a ray saw, are dropped on the way.
 
     Args:
         views: held-out ones are not looked at.

@@ -14,27 +14,25 @@ from dataclasses import field as default
 import numpy as np
 import torch
 
+from fieldfuse.camera import Array
 from fieldfuse.capture.types import Views
 from fieldfuse.config import Settings
 from fieldfuse.errors import InputError
 from fieldfuse.memory import give_back
-from fieldfuse.nerfusion.decoder import make_decoder
 from fieldfuse.poses.scene import Scene
 from fieldfuse.progress import SILENT, Progress
 from fieldfuse.render.field import Field
 from fieldfuse.stereo.transients import LeftOut
-from fieldfuse.training import room
-from fieldfuse.training.behind import sky_behind
-from fieldfuse.training.depth import FINE, ROUGH
+from fieldfuse.tone import decode, encode
+from fieldfuse.training import memory_limits
+from fieldfuse.training.background_sh import sky_behind
 from fieldfuse.training.engine import Engine, chosen_engine, fit_device, make_engine, warm_up
-from fieldfuse.training.finite import NotFiniteError
-from fieldfuse.training.guard import Guard, refuse_broken
-from fieldfuse.training.levels import all_places, finer, first_field, let_go, looked_at, pruned, visible
-from fieldfuse.training.rays import PixelPool
-from fieldfuse.training.sample import Sample
+from fieldfuse.training.levels import NewField, all_places, finer, looked_at, pruned, release_unused, visible
+from fieldfuse.training.losses import FINE, ROUGH
+from fieldfuse.training.nonfinite_policy import NonfinitePolicy, NotFiniteError, refuse_broken
+from fieldfuse.training.pixels import Batch, PixelPool
 from fieldfuse.training.schedule import RUNGS, UNTOLD, WIDER, Schedule, most_rays
-from fieldfuse.training.start import NEAR, THIN, colour_behind, finest_resolution, levels, possible, space_of
-from fieldfuse.training.view import limit
+from fieldfuse.training.start import NEAR, THIN, colour_behind, finest_resolution, levels, new_decoder, possible, space_of
 from fieldfuse.volume.host import Host, TorchHost
 from fieldfuse.volume.space import Space
 
@@ -42,7 +40,7 @@ DEFAULT_BUDGET = 120.0
 TIMELINE_POINTS = 12
 TIMELINE_PIXELS = 8192
 VALIDATION_PIXELS = 2048
-VALIDATION_SHARE = 20  # every so manieth training view steers the schedule …
+VALIDATION_SHARE = 20  # every n-th training view steers the schedule …
 LEAST_VIEWS = 24  # … when there are enough: with few views each of them is worth more than what it would decide
 MANY_ROWS = 2**19  # from here on memory of rows that pruning left unused is given back
 MANY_VOXELS = 2_000_000  # beyond this a finer level is made only where rays came
@@ -59,7 +57,7 @@ class FitResult:
     rays: int = 0
     interrupted: bool = False
     notes: list[str] = default(default_factory=list)  # a sentence on each step that was not finite, and on what it had to do without
-    matched: dict[str, float] | None = None  # what was matched before the fit: pictures, pixels, share with depth, seconds (`guided.py`)
+    matched: dict[str, float] | None = None  # what was matched before the fit: images, pixels, share with depth, seconds (`guided.py`)
     left_out: LeftOut | None = None  # what the fit did without, since it moves (`guided.py`)
     held_out: list[float] = default(default_factory=list)  # the timeline's last PSNR by held-out view
 
@@ -85,15 +83,76 @@ class Clock:
         self._since = self.ticks()
 
 
+@dataclass(frozen=True)
+class Begin:
+    """What a fit begins with besides its views.
+
+    Attributes:
+        host: where rows live while they change (`GridHost` puts them into Open3D's hash map); None: plain tensors.
+        start: a field to go on from, at its finest level, or what gives it; then no reference to it is held while its levels are climbed.
+        coarse: `start` is a first guess and no fitted field: climb from its level to the finest, as from the classical start.
+        rungs: share of the budget at which each level ends at the latest, from the first one on; with too few views to keep some aside for
+            validation it ends by `UNTOLD`, if that is sooner. None: as fits the start.
+    """
+
+    host: Host | None = None
+    start: Field | Callable[[], Field] | None = None
+    coarse: bool = False
+    rungs: tuple[float, ...] | None = None
+
+
+class Sample:
+    """PSNR over a fixed random sample of some views' pixels: the mean over views, in the colours of their photos, as the report's table
+    counts it."""
+
+    def __init__(self, views: Views, indices: Array, pixels: int, device: torch.device) -> None:
+        self.batch: Batch | None = None
+        self.factor: Array | None = None  # (P, 3) what was taken out of the pixels' light; None: nothing
+        if len(indices):
+            some = views.subset(indices)
+            pool = PixelPool(replace(some, images=[some.photo(index) for index in range(len(some))]), device)
+            pick = torch.randperm(len(pool), generator=torch.Generator().manual_seed(0))[:pixels].to(device)
+            self.batch, self.factor = pool.take(pick), _factors(some, *(place.cpu().numpy() for place in pool.seen_at(pick)))
+
+    def psnr(self, engine: Engine) -> float | None:
+        """Decibels, the mean over views; None: there are none."""
+        each = self.each(engine)
+        return float(each.mean()) if len(each) else None
+
+    def each(self, engine: Engine) -> Array:
+        """(V,) decibels of each view that has pixels in the sample."""
+        if self.batch is None:
+            return np.zeros(0)
+        error = (self._as_taken(engine.colours(self.batch.origins, self.batch.directions)) - self.batch.colour).square().mean(-1)
+        views, pixels = self.batch.view.unique(return_inverse=True, return_counts=True)[1:]
+        of_views = torch.zeros(len(pixels), device=error.device).index_add(0, views, error) / pixels
+        return np.asarray((-10 * of_views.clamp_min(1e-10).log10()).cpu().numpy())
+
+    def _as_taken(self, shown: torch.Tensor) -> torch.Tensor:
+        """(P, 3) colours of the sample's pixels with what was taken out of their images put back."""
+        if self.factor is None:
+            return shown
+        return torch.from_numpy(encode(decode(shown.detach().cpu().numpy().astype(np.float64)) * self.factor)).to(shown)
+
+
+def _factors(views: Views, view: Array, row: Array, column: Array) -> Array | None:
+    """(P, 3) what was taken out of the light of pixels, so that their images are not as they were taken; None: nothing."""
+    if all(photo is None for photo in views.photos):
+        return None
+    out = np.ones((len(view), 3))
+    for index, (tone, photo) in enumerate(zip(views.tones, views.photos, strict=True)):
+        mine = view == index
+        if tone is not None and photo is not None:
+            out[mine] = np.broadcast_to(tone.factor(views.intrinsics[index]), photo.shape)[row[mine], column[mine]]
+    return out
+
+
 def fit_field(
     views: Views,
     scene: Scene,
     settings: Settings,
     progress: Progress = SILENT,
-    host: Host | None = None,
-    start: Field | Callable[[], Field] | None = None,
-    coarse: bool = False,
-    rungs: tuple[float, ...] = RUNGS,
+    begin: Begin = Begin(),
     ticks: Callable[[], float] = time.perf_counter,
 ) -> FitResult:
     """Fit a field to the training views.
@@ -103,58 +162,58 @@ def fit_field(
         scene: region of interest, near and far, and whether there is a background, in the same working frame.
         settings: `field`, `fit`, `seed`; `fit.budget` bounds the seconds.
         progress: `stopping()` ends the fit early and keeps what there is.
-        host: where rows live while they change (`GridHost` puts them into Open3D's hash map).
-        start: a field to go on from, at its finest level, or what gives it; then nobody need hold it while its levels are climbed.
-        coarse: `start` is a first guess and no fitted field: climb from its level to the finest, as from the classical start.
-        rungs: share of the budget at which each level ends at the latest, from the first one on; with too few views to keep some aside for
-            validation it ends by `UNTOLD`, if that is sooner.
         ticks: the clock, in seconds, that the budget is counted on; a benchmark beside other work takes `time.process_time`.
 
     Raises:
-        InputError: there is no training view or pixel, `start` is not finite or holds nothing, not one step was finite, or there is no
+        InputError: there is no training view or pixel, the start is not finite or holds nothing, not one step was finite, or there is no
             memory for it.
     """
     device = fit_device(settings)
     train = views.subset(np.flatnonzero(~views.test))
     if len(train) == 0:
-        raise InputError("no training view is left; lower --holdout or give more pictures")
-    host = host or TorchHost(device)
-    start = start() if callable(start) else start
-    generator = torch.Generator().manual_seed(settings.seed)
+        raise InputError("no training view is left; lower --holdout or give more images")
+    host = begin.host or TorchHost(device)
+    start = begin.start() if callable(begin.start) else begin.start
     torch.manual_seed(settings.seed)
     held_out = Sample(views, np.flatnonzero(views.test), TIMELINE_PIXELS, device)
     aside = np.arange(len(train)) % VALIDATION_SHARE == VALIDATION_SHARE // 2 if len(train) >= LEAST_VIEWS else np.zeros(len(train), bool)
     validation = Sample(train, np.flatnonzero(aside), VALIDATION_PIXELS, device)
-    room.require_start(train, start, settings, device)
+    memory_limits.require_start(train, start, settings, device)
     # Views that are kept aside come last, so that joining them is a matter of a limit.
     ordered = train.subset(np.argsort(aside, kind="stable"))
     pool = PixelPool(ordered, device, depth=settings.fit.depth > 0)
     pool.limit = int(pool.starts[np.count_nonzero(~aside)])
     if pool.limit == 0:
-        raise InputError("every pixel of the training pictures is masked away; look at the capture's masks (black is left out)")
+        raise InputError("every pixel of the training images is masked away; look at the capture's masks (black is left out)")
     budget = settings.fit.budget or DEFAULT_BUDGET
     warm_up(settings, progress)
     clock = Clock(ticks)
     if start is None:
-        current, ladder = _first(views, train, scene, settings, device, host, generator)
+        current, ladder = _first(views, scene, settings, device, host)
     else:
         refuse_broken(start)
         keep = torch.ones_like(start.occupied)
         current, ladder = finer(start, keep, start.resolution, host), [start.resolution]
-        if coarse:
-            ladder += [resolution for resolution in _ladder(views, train, scene, settings)[1] if resolution > start.resolution]
+        if begin.coarse:
+            ladder += [resolution for resolution in _ladder(views, scene, settings)[1] if resolution > start.resolution]
     start = None  # its rows are the host's now
     engine = make_engine(settings, current, pool)
-    limit_rays = most_rays(len(pool), bool(aside.any()), settings.fit.passes)
-    slow_within = settings.fit.slow_within * scene.median_depth
-    trust = ROUGH if views.rough else FINE
-    wider = WIDER if chosen_engine(settings, device) == "triton" else 1
-    opaque, patient = views.background is None, settings.fit.patience
-    rungs = rungs if aside.any() else tuple(map(min, rungs, UNTOLD))
-    plan = Schedule(ladder, budget, settings.fit, opaque, patient, limit_rays, slow_within, trust, rungs, wider)
+    rungs = begin.rungs or RUNGS
+    plan = Schedule(
+        ladder,
+        budget,
+        settings.fit,
+        opaque=views.background is None,
+        patient=settings.fit.patience,
+        most_rays=most_rays(len(pool), bool(aside.any()), settings.fit.passes),
+        slow_within=settings.fit.slow_within * scene.median_depth,
+        trust=ROUGH if views.rough else FINE,
+        rungs=rungs if aside.any() else tuple(map(min, rungs, UNTOLD)),
+        wider=WIDER if chosen_engine(settings, device) == "triton" else 1,
+    )
     softens, radius = len(train) >= LEAST_VIEWS, 0.0
-    guard = Guard()
-    result = FitResult(current, notes=guard.notes)
+    policy = NonfinitePolicy()
+    result = FitResult(current, notes=policy.notes)
     marks = [budget * 0.02 * 50 ** (i / (TIMELINE_POINTS - 1)) for i in range(TIMELINE_POINTS - 1)]
 
     while (done := plan.position(now := clock.seconds(), result.rays)) < 1 and not progress.stopping():
@@ -166,16 +225,16 @@ def fit_field(
                 came = keep & (engine.visits > 0)
                 voxels = int(came.sum()) * growth  # what stays for the sake of holes gets no rays, so it does not decide
                 keep = keep & looked_at(current, engine.seen, engine.visits, settings.fit.prune_weight) if plan.next_is_finest else came
-            if plan.worth(voxels, plan.rays_left(now, result.rays)) and room.fits(current, keep, plan, settings, guard.notes):
+            if plan.worth(voxels, plan.rays_left(now, result.rays)) and memory_limits.fits(current, keep, plan, settings, policy.notes):
                 plan.climb()
-                engine.let_go()
+                engine.release()
                 give_back()
                 current = finer(current, keep, plan.resolution, host)
                 engine.renew_rows(current)
         elif plan.wants_pruning(done):
             current = pruned(current, visible(current, engine.seen, engine.visits, settings.fit.prune_weight))
             if len(current.occupied) >= MANY_ROWS:
-                let_go(current)
+                release_unused(current)
                 give_back()
             engine.go_on_with(current)
         if softens and plan.radius(done) != radius:
@@ -187,9 +246,9 @@ def fit_field(
             plan.look(psnr, done)
         rays = plan.rays
         try:
-            engine.step(rays, guard.eased(plan.rates(done, result.rays)))
+            engine.step(rays, policy.scaled_rates(plan.rates(done, result.rays)))
         except NotFiniteError as error:
-            if guard.goes_on(error, result.steps, plan.resolution, now):
+            if policy.handle(error, result.steps, plan.resolution, now):
                 continue
             break
         plan.steps += 1
@@ -209,7 +268,7 @@ def fit_field(
     result.seconds = clock._spent
     _measure(result, held_out, engine, result.seconds)
     current = engine.sync()
-    engine.let_go()
+    engine.release()
     del engine, pool
     give_back()
     packed = current.packed()
@@ -220,23 +279,18 @@ def fit_field(
     return result
 
 
-def _first(
-    views: Views, train: Views, scene: Scene, settings: Settings, device: torch.device, host: Host, generator: torch.Generator
-) -> tuple[Field, list[int]]:
+def _first(views: Views, scene: Scene, settings: Settings, device: torch.device, host: Host) -> tuple[Field, list[int]]:
     """The classical start at the coarsest level, and the resolutions to climb."""
-    space, ladder = _ladder(views, train, scene, settings)
+    space, ladder = _ladder(views, scene, settings)
     places = possible(space, ladder[0], all_places(space, ladder[0]), views)
-    decoder = make_decoder(settings.field.decoder, settings.field.channels, settings.field.width).to(device)
-    limit(decoder, settings.field.view)
-    behind = colour_behind(views).to(device)
-    near = NEAR * scene.near
-    fine = 4
-    return first_field(space, ladder[0], places, settings.field.channels, THIN, decoder, behind, near, fine, host, generator), ladder
+    blank = NewField(space, ladder[0], new_decoder(settings.field).to(device), colour_behind(views).to(device), NEAR * scene.near)
+    return blank.on(places, host, THIN, torch.Generator().manual_seed(settings.seed)), ladder
 
 
-def _ladder(views: Views, train: Views, scene: Scene, settings: Settings) -> tuple[Space, list[int]]:
+def _ladder(views: Views, scene: Scene, settings: Settings) -> tuple[Space, list[int]]:
     """The space, and its resolutions from coarse to fine."""
     space = space_of(views, scene, settings.field.background)
+    train = views.subset(np.flatnonzero(~views.test))
     return space, levels(settings.field.resolution or finest_resolution(space, train, scene))
 
 

@@ -30,7 +30,7 @@ from fieldfuse.poses.scene import Scene
 from fieldfuse.progress import SILENT, Progress
 from fieldfuse.render.field import Field
 from fieldfuse.render.fused import make_field, without_empty_blocks
-from fieldfuse.training.behind import sky_behind
+from fieldfuse.training.background_sh import sky_behind
 from fieldfuse.training.finer_colours import finer_colours
 from fieldfuse.training.silhouettes import inside_silhouettes, visual_hull
 from fieldfuse.training.start import colour_behind, space_of
@@ -42,7 +42,7 @@ SHIPPED = weights.SHIPPED
 # gain 0.25 dB for about three times the seconds (docs/measured/few_views.md), so none need be smaller than some pixels; a larger one shows.
 VOXELS_TO_MEDIAN, LEVELS = 48.0, 2
 PIXELS = 5.0  # that a voxel spans at most: colours become finer afterwards (`finer_colours.py`) …
-MEASURED_PIXELS = 3.5  # … where a sensor's depth says more exactly where surfaces are …
+MEASURED_PIXELS = 3.5  # … where a sensor's depth is more exact about where surfaces are …
 OBJECT_PIXELS = 2.6  # … and where alpha cuts the object out: fewer voxels are in play
 GAMMA = 0.95  # the paper's 0.6 cuts holes where the networks are in doubt
 LEAST, MOST = 32, 384  # resolution of the lattice
@@ -50,15 +50,15 @@ LEAST, MOST = 32, 384  # resolution of the lattice
 
 @dataclass(frozen=True)
 class NetworkOptions:
-    """What direct inference can be told.
+    """Settings of direct inference.
 
     Attributes:
-        voxels: voxels that make up the median depth, on the finest lattice; None: as `voxels_to_median` says.
+        voxels: voxels that make up the median depth, on the finest lattice; None: see `voxels_to_median`.
         levels: lattices, each of half the voxel size of the one before; 1: the paper's single one.
         gamma: see-through voxels (exp(−optical thickness) above it) are not rendered; None: all are.
         measured: the views' depth goes into the key frames' sweeps.
         agreement: key frames' sweeps are held against each other, but for captures with alpha, where the visual hull is known.
-        recolour: `Inference.result` looks colours up again in the training pictures (`finer_colours`).
+        recolour: `Inference.result` looks colours up again in the training images (`finer_colours`).
         precision: of the networks' arithmetic (`nerfusion.precision`).
     """
 
@@ -72,7 +72,7 @@ class NetworkOptions:
 
     @classmethod
     def of(cls, settings: NetworkSettings) -> NetworkOptions:
-        """As the settings say."""
+        """Those of the settings."""
         measured = settings.depth_from == "sensor"
         switches = {"measured": measured, "agreement": settings.agreement, "recolour": settings.recolour}
         return cls(settings.voxels, settings.levels, settings.gamma, **switches, precision=settings.precision)
@@ -89,7 +89,7 @@ def load_networks(path: Path | str | None = None, device: torch.device | str = "
 
 def voxels_to_median(views: Views, measured: bool = False) -> float:
     """Voxels that make up the median depth: 48, or as many as let a voxel there span no more than `PIXELS` of the views, fewer pixels where
-    the views have alpha, and `MEASURED_PIXELS` where their depth is measured and asked."""
+    the views have alpha, and `MEASURED_PIXELS` where their measured depth is used."""
     pixels = PIXELS
     if measured and any(depth is not None for depth in views.depths):
         pixels = MEASURED_PIXELS
@@ -106,7 +106,7 @@ def lattice_of(space: Space, scene: Scene, voxels: float, levels: int) -> Lattic
 
 
 class Inference:
-    """The networks at work on one capture: iterate to fuse key frame after key frame, and ask for the field in between or at the end."""
+    """The networks at work on one capture: iterate to fuse key frame after key frame, and take the field in between or at the end."""
 
     def __init__(
         self,
@@ -128,7 +128,7 @@ class Inference:
         """
         train = np.flatnonzero(~np.asarray(views.test))
         if len(train) == 0 or len(keys.indices) == 0:
-            raise InputError("no training view is left for the networks; lower --holdout or give more pictures")
+            raise InputError("no training view is left for the networks; lower --holdout or give more images")
         self.model, self.keys, self.options = model, keys, options or NetworkOptions()
         self.train = views.subset(train)
         self.near, self.far, self.median_depth = scene.near, scene.far, scene.median_depth
@@ -150,7 +150,7 @@ class Inference:
         """
         measured, precision = self.options.measured, self.options.precision
         options = FusionOptions(self.options.levels, self.near, self.far, measured=measured, precision=precision)
-        # Things without texture that stand before nothing lead all sweeps astray in the same way; the hull knows better.
+        # Things without texture that stand before nothing lead all sweeps astray in the same way; the hull is the better guide.
         agree = self.options.agreement and self.hull is None and (self.near > 0 or math.isfinite(self.far))
         witnesses = overlapping(self.keys, self.train.world_from_camera, self.train.intrinsics, self.median_depth) if agree else None
         for fused in fuse_views(self.model, self.train, self.keys, self.lattice, options, progress, self.hull, witnesses):
@@ -183,7 +183,7 @@ class Inference:
         return made
 
     def result(self, progress: Progress = SILENT, engine: str = "auto") -> Field:
-        """What direct inference gives, when no more key frame will come: the field with colours looked up again if the options say so;
+        """What direct inference gives, when no more key frame will come: the field with colours looked up again if the options have it;
         some seconds.
 
         Raises:

@@ -1,7 +1,7 @@
-"""A fit that knows depth, and what moves: both are found in the first share of its budget.
+"""A fit with known depth and without what moves: both are found in the first share of its budget.
 
-Depth is the capture's own, or what quick matching of the pictures finds. With it, pictures can be held against each other, and the fit
-begins with what it tells.
+Depth is the capture's own, or what quick matching of the images finds. With it, images can be held against each other, and the fit
+begins with it.
 """
 
 from __future__ import annotations
@@ -10,7 +10,6 @@ import contextlib
 import time
 from collections.abc import Callable
 from dataclasses import replace
-from typing import TypedDict, Unpack
 
 import numpy as np
 
@@ -20,23 +19,12 @@ from fieldfuse.errors import InputError, Interrupted
 from fieldfuse.memory import give_back
 from fieldfuse.poses.scene import Scene
 from fieldfuse.progress import SILENT, Progress
-from fieldfuse.render.field import Field
 from fieldfuse.stereo import fast_mvs, transients
 from fieldfuse.stereo.transients import LeftOut
 from fieldfuse.training import depth_start
 from fieldfuse.training.engine import fit_device, warm_up
-from fieldfuse.training.fit import DEFAULT_BUDGET, Clock, FitResult, fit_field
+from fieldfuse.training.fit import DEFAULT_BUDGET, Begin, Clock, FitResult, fit_field
 from fieldfuse.training.schedule import GUESSED, PARTLY, RUNGS
-from fieldfuse.volume.host import Host
-
-
-class Begin(TypedDict, total=False):
-    """What a fit begins with besides its views; see `fit_field`."""
-
-    host: Host | None
-    start: Field | Callable[[], Field] | None
-    coarse: bool
-    rungs: tuple[float, ...]
 
 
 class Part(Progress):
@@ -55,7 +43,7 @@ class Part(Progress):
 def wants_matching(views: Views, settings: Settings) -> bool:
     """Whether a fit of these views begins with matching: no depth is known, and the settings leave it to us (`fit.depth_from=auto`).
 
-    Not where alpha cuts an object out: silhouettes tell enough there (lego 28.6 dB after 30 s without, 28.4 with matching).
+    Not where alpha cuts an object out: silhouettes are enough there (lego 28.6 dB after 30 s without, 28.4 with matching).
     """
     known = any(depth is not None for depth in views.depths) or views.background is not None
     return settings.fit.depth_from == "auto" and settings.fit.depth > 0 and not known
@@ -71,24 +59,24 @@ def fit_guided(
     scene: Scene,
     settings: Settings,
     progress: Progress = SILENT,
+    begin: Begin = Begin(),  # noqa: B008 (frozen)
     ticks: Callable[[], float] = time.perf_counter,
-    **begin: Unpack[Begin],
 ) -> FitResult:
     """`fit_field`, with quick matching before it where that is wanted, without what moves, and, unless `begin` has a start, from what is
     known of depth. The seconds of all three are a part of the budget, and of the timeline. A start that is a guess (`coarse`) is gone on
     from in steps of its own, unless `begin` has others.
 
-    What cannot be matched is fitted to colours alone, and `notes` says why.
+    What cannot be matched is fitted to colours alone, with the reason in `notes`.
 
     Raises:
-        Interrupted: the user asked to stop while pictures were matched.
+        Interrupted: the user asked to stop while images were matched.
         InputError: as `fit_field`.
     """
-    if begin.get("coarse"):
-        begin.setdefault("rungs", GUESSED)
+    if begin.coarse and begin.rungs is None:
+        begin = replace(begin, rungs=GUESSED)
     matching = wants_matching(views, settings)
     if not (matching or looks_for_moving(views, settings) or depth_start.starts_by_depth(views, settings)):
-        return fit_field(views, scene, settings, progress, ticks=ticks, **begin)
+        return fit_field(views, scene, settings, progress, begin, ticks)
     warm_up(settings, progress)
     fast_mvs.warm_up()
     depth_start.warm_up()
@@ -108,15 +96,15 @@ def fit_guided(
             left_out = find_moving(known, matched, scene, budget, progress)
     left_out = None if left_out is None else replace(left_out, seconds=clock.seconds() - matched_for)
     shown = known if left_out is None else left_out.without(known)
-    if begin.get("start") is None and depth_start.starts_by_depth(shown, settings):
+    if begin.start is None and depth_start.starts_by_depth(shown, settings):
         first = depth_start.depth_start(shown, scene, settings, fit_device(settings))
-        begin["rungs"] = RUNGS if first.resolution == depth_start.RESOLUTION_KNOWN else PARTLY
-        begin["start"], begin["coarse"] = [first].pop, True  # once it is taken nobody here holds it
+        rungs = RUNGS if first.resolution == depth_start.RESOLUTION_KNOWN else PARTLY
+        begin = replace(begin, start=[first].pop, coarse=True, rungs=rungs)  # once it is taken no reference is left here
         del first
-    give_back()  # what pictures, costs and votes took
+    give_back()  # what images, costs and votes took
     spent = clock.seconds()
     rest = replace(settings, fit=replace(settings.fit, budget=max(budget - spent, 0.5 * budget)))
-    result = fit_field(shown, scene, rest, Part(progress, spent, budget, budget), ticks=ticks, **begin)
+    result = fit_field(shown, scene, rest, Part(progress, spent, budget, budget), begin, ticks)
     result.timeline = result.after(spent)
     result.seconds += spent
     result.notes = notes + result.notes
@@ -128,8 +116,8 @@ def fit_guided(
 def find_moving(
     views: Views, matched: fast_mvs.Matched | None, scene: Scene, budget: float, progress: Progress = SILENT
 ) -> LeftOut | None:
-    """What moves in the training pictures of `views`, by the depth that was `matched`, or by their own; None: no depth is known, by
-    matching of too few pictures, or they are too many for a fit of `budget` seconds.
+    """What moves in the training images of `views`, by the depth that was `matched`, or by their own; None: no depth is known, by
+    matching of too few images, or they are too many for a fit of `budget` seconds.
 
     Raises:
         Interrupted: the user asked to stop.

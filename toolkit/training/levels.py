@@ -2,14 +2,16 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
+from dataclasses import dataclass, replace
 
 import torch
 
+from fieldfuse.backends.dispatch import is_cpu
 from fieldfuse.nerfusion.decoder import Deferred, PerSample
 from fieldfuse.render.field import Field
-from fieldfuse.volume.edit import dilate, erase_empty_blocks, resample, split, with_corner_blocks
-from fieldfuse.volume.host import Host
+from fieldfuse.volume import compiled
+from fieldfuse.volume.edit import corner_nodes, dilate, erase_empty_blocks, resample, split, with_corner_blocks
+from fieldfuse.volume.host import Host, Hosted
 from fieldfuse.volume.space import Space
 from fieldfuse.volume.topology import BLOCK, VOXELS, Topology
 
@@ -20,9 +22,7 @@ ENOUGH_VISITS = 4
 
 def all_places(space: Space, resolution: int) -> Tensor:
     """(N, 3) lattice coordinates of every voxel that touches the space."""
-    line = torch.arange(resolution)
-    z, y, x = torch.meshgrid(line, line, line, indexing="ij")
-    places = torch.stack([x.reshape(-1), y.reshape(-1), z.reshape(-1)], 1)
+    places = torch.cartesian_prod(*[torch.arange(resolution)] * 3).flip(1)
     if space.shell == 0:
         voxel = 2 * space.extent / resolution
         centre = (places + 0.5) * voxel - space.extent
@@ -45,46 +45,51 @@ def occupancy(places: Tensor) -> tuple[Topology, Tensor]:
     return with_corner_blocks(topology, occupied)
 
 
-def _housed(field: Field, topology: Topology, occupied: Tensor, density: Tensor, feature: Tensor, resolution: int, host: Host) -> Field:
-    """The values in rows of the host, whose order of blocks may differ."""
-    voxel_size = 2 * field.space.extent / resolution * field.space.half
-    hosted = host.allocate(topology.keys, feature.shape[1], voxel_size)
-    slot = topology.find(hosted.topology.keys)
-    hosted.density[:-1].view(-1, VOXELS).copy_(density[:-1].view(-1, VOXELS)[slot])
-    hosted.feature[:-1].view(len(slot), -1).copy_(feature[:-1].view(len(slot), -1)[slot])
-    ordered = occupied.view(-1, VOXELS)[slot].reshape(-1)
+def _housed(field: Field, occupied: Tensor, resolution: int, host: Host) -> Field:
+    """The field on a lattice of `resolution`, in rows of the host, whose order of blocks may differ."""
+    hosted = host.allocate(field.topology.keys, field.feature_rows.shape[1], 2 * field.space.extent / resolution * field.space.half)
+    slot = field.topology.find(hosted.topology.keys)
+    for new, old in ((hosted.density, field.density_rows), (hosted.feature, field.feature_rows)):
+        new[:-1].view(len(slot), -1).copy_(old[:-1].view(len(slot), -1)[slot])
+    occupied = occupied.view(-1, VOXELS)[slot].reshape(-1)
+    return in_rows(field, hosted, occupied, resolution)
+
+
+def in_rows(field: Field, hosted: Hosted, occupied: Tensor, resolution: int) -> Field:
+    """The field with other rows."""
+    density, feature = hosted.density, hosted.feature
     return replace(
-        field, resolution=resolution, topology=hosted.topology, occupied=ordered, density_rows=hosted.density, feature_rows=hosted.feature
+        field, resolution=resolution, topology=hosted.topology, occupied=occupied, density_rows=density, feature_rows=feature
     )
 
 
-def first_field(
-    space: Space,
-    resolution: int,
-    places: Tensor,
-    channels: int,
-    raw_density: float,
-    decoder: Deferred | PerSample,
-    background: Tensor,
-    near: float,
-    fine: int,
-    host: Host,
-    generator: torch.Generator,
-) -> Field:
-    """A field with the voxels at `places` (N, 3): one density everywhere, grey but for a little noise that breaks the symmetry."""
-    topology, occupied = occupancy(places.to(background.device))
-    size = topology.zero_row + 1
-    density = torch.full((size,), raw_density, device=background.device)
-    feature = (torch.randn(size, channels, generator=generator) * FEATURE_NOISE).to(background.device)
-    start = Field(space, resolution, topology, occupied, density, feature, decoder, background, near, fine)
-    return _housed(start, topology, occupied, density, feature, resolution, host)
+@dataclass(frozen=True)
+class NewField:
+    """What a field has before it has voxels; see `Field`."""
+
+    space: Space
+    resolution: int
+    decoder: Deferred | PerSample
+    background: Tensor
+    near: float = 0.0
+    fine: int = 4
+
+    def on(self, places: Tensor, host: Host, raw_density: float = 0.0, generator: torch.Generator | None = None) -> Field:
+        """The field with the voxels at `places` (N, 3): one density everywhere, grey but for a little noise that breaks the symmetry."""
+        device = self.background.device
+        topology, occupied = occupancy(places.to(device))
+        size = topology.zero_row + 1
+        density = torch.full((size,), raw_density, device=device)
+        feature = (torch.randn(size, self.decoder.channels, generator=generator) * FEATURE_NOISE).to(device)
+        values = (topology, occupied, density, feature, self.decoder, self.background, self.near, self.fine)
+        return _housed(Field(self.space, self.resolution, *values), occupied, self.resolution, host)
 
 
 def visible(field: Field, seen: Tensor, visits: Tensor, threshold: float) -> Tensor:
     """(M · 512,) bool: the occupied voxels that stay.
 
     A voxel stays within one voxel of one that training rays saw with a weight T·α above `threshold`, and as long as too few samples fell
-    into it to tell: in captures with many pixels a few hundred steps do not look everywhere. When nothing was seen that strongly (a very
+    into it to judge: in captures with many pixels a few hundred steps do not look everywhere. When nothing was seen that strongly (a very
     thin start), everything stays.
 
     Args:
@@ -107,11 +112,7 @@ def looked_at(field: Field, seen: Tensor, visits: Tensor, threshold: float) -> T
 
 
 def beside(topology: Topology, strong: Tensor) -> Tensor:
-    """(M · 512,) bool grown by one voxel."""
-    if strong.device.type == "cpu":
-        from fieldfuse.volume.compiled import dilated
-
-        return dilated(topology, strong)
+    """(M · 512,) bool grown by one voxel, within these blocks."""
     return dilate(topology, strong, 1, grow=False)[1]
 
 
@@ -120,41 +121,28 @@ def pruned(field: Field, keep: Tensor) -> Field:
     return replace(field, occupied=field.occupied & keep)
 
 
-def let_go(field: Field) -> None:
+def release_unused(field: Field) -> None:
     """On the CPU, give back the memory of rows that no voxel uses any more after pruning. They read as zero, so what the field was before
     is void; its rows must be in memory of this process alone."""
-    if field.device.type == "cpu":
-        from fieldfuse.volume import compiled
-
-        compiled.let_go(compiled.corner_nodes(field.topology, field.occupied), field.density_rows, field.feature_rows)
+    if is_cpu(field.device):
+        compiled.release_unused(corner_nodes(field.topology, field.occupied), field.density_rows, field.feature_rows)
 
 
 def finer(field: Field, keep: Tensor, resolution: int, host: Host) -> Field:
-    """The same function, where `keep` says, on a lattice of `resolution` voxels a side; rows are new."""
-    values = [field.density_rows, field.feature_rows]
-    if field.device.type == "cpu":
-        from fieldfuse.volume.compiled import refined
-
-        voxel_size = 2 * field.space.extent / resolution * field.space.half
-        kept = field.occupied & keep
-        ratio = resolution / field.resolution
-        hosted, occupied = refined(field.topology, kept, field.density_rows, field.feature_rows, ratio, host, voxel_size)
-        return replace(
-            field,
-            resolution=resolution,
-            topology=hosted.topology,
-            occupied=occupied,
-            density_rows=hosted.density,
-            feature_rows=hosted.feature,
-        )
-    topology, occupied, rows = erase_empty_blocks(field.topology, field.occupied & keep, values)
-    if resolution == 2 * field.resolution:
-        topology, occupied, rows = split(topology, occupied, rows)
+    """The same function, where `keep` is true, on a lattice of `resolution` voxels a side; rows are new."""
+    kept, ratio = field.occupied & keep, resolution / field.resolution
+    if is_cpu(field.device):
+        rows, voxel_size = (field.density_rows, field.feature_rows), 2 * field.space.extent / resolution * field.space.half
+        return in_rows(field, *compiled.refined(field.topology, kept, rows, ratio, host, voxel_size), resolution)
+    topology, occupied, values = erase_empty_blocks(field.topology, kept, [field.density_rows, field.feature_rows])
+    if ratio == 2:
+        topology, occupied, values = split(topology, occupied, values)
     else:
-        new_topology, new_occupied = occupancy(_finer_places(topology, occupied, resolution / field.resolution))
-        rows = resample(topology, occupied, rows, new_topology.keys, field.resolution / resolution)
+        new_topology, new_occupied = occupancy(_finer_places(topology, occupied, ratio))
+        values = resample(topology, occupied, values, new_topology.keys, 1 / ratio)
         topology, occupied = new_topology, new_occupied
-    return _housed(field, topology, occupied, rows[0], rows[1], resolution, host)
+    made = replace(field, topology=topology, occupied=occupied, density_rows=values[0], feature_rows=values[1])
+    return _housed(made, occupied, resolution, host)
 
 
 def _finer_places(topology: Topology, occupied: Tensor, ratio: float) -> Tensor:
@@ -164,11 +152,6 @@ def _finer_places(topology: Topology, occupied: Tensor, ratio: float) -> Tensor:
     place = topology.keys[slot].long() * BLOCK + torch.stack([local & 7, (local >> 3) & 7, local >> 6], 1)
     low = torch.ceil(place.double() * ratio - 0.5).long()
     high = torch.ceil((place + 1).double() * ratio - 0.5).long()
-    parts = []
-    reach = range(int(ratio) + 1)
-    for z in reach:
-        for y in reach:
-            for x in reach:
-                moved = low + torch.tensor([x, y, z], device=low.device)
-                parts.append(moved[(moved < high).all(1)])
-    return torch.cat(parts)
+    steps = torch.cartesian_prod(*[torch.arange(int(ratio) + 1, device=low.device)] * 3).flip(1)
+    moved = [low + step for step in steps]
+    return torch.cat([places[(places < high).all(1)] for places in moved])

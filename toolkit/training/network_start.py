@@ -1,6 +1,6 @@
 """From the networks' field to the start of a fit: geometry and, for the deferred decoder, features and decoder at a level of the fit.
 
-The fit's lattice is another one than the networks', so values are interpolated. What the networks know nothing of starts as thin and grey
+The fit's lattice is another one than the networks', so values are interpolated. What they found nothing of starts as thin and grey
 as in the classical start; densities are kept between two bounds, so that a mistake of the networks can still be unlearnt.
 """
 
@@ -13,11 +13,11 @@ import torch
 
 from fieldfuse.capture.types import Views
 from fieldfuse.config import Settings
-from fieldfuse.nerfusion.decoder import Deferred, PerSample, make_decoder
+from fieldfuse.nerfusion.decoder import Deferred, PerSample
 from fieldfuse.poses.scene import Scene
 from fieldfuse.render.field import Field
 from fieldfuse.training.levels import FEATURE_NOISE, all_places, occupancy
-from fieldfuse.training.start import NEAR, THIN, finest_resolution, levels, possible
+from fieldfuse.training.start import NEAR, THIN, finest_resolution, levels, new_decoder, possible
 from fieldfuse.volume.edit import resample
 
 Tensor = torch.Tensor
@@ -26,7 +26,7 @@ THICK = 0.0
 
 
 def widened(decoder: Deferred, hidden: int, generator: torch.Generator) -> Deferred:
-    """The same function with `hidden` units a layer (at least its own): the new ones read, but nobody reads them yet."""
+    """The same function with `hidden` units a layer (at least its own): the new ones read others, but none reads them yet."""
     if hidden < decoder.hidden:
         raise ValueError(f"a decoder of {decoder.hidden} hidden units cannot be narrowed to {hidden}")
     out = Deferred(decoder.channels, hidden)
@@ -59,7 +59,7 @@ def network_start(made: Field, views: Views, scene: Scene, settings: Settings) -
     places = possible(made.space, resolution, all_places(made.space, resolution), views)
     topology, occupied = occupancy(places.to(device))
     scale = made.resolution / resolution
-    # Thickness instead of its logarithm is what adds up when voxels are merged; the mark tells what the networks knew.
+    # Thickness instead of its logarithm is what adds up when voxels are merged; the mark is 1 where the networks had a value.
     known = torch.cat([torch.ones_like(made.density_rows[:-1]), made.density_rows.new_zeros(1)])
     raw, feature, mark = resample(made.topology, made.occupied, [made.density_rows, made.feature_rows, known], topology.keys, scale)
     density = torch.where(mark > 0, raw.clamp(THIN, THICK), torch.full_like(raw, THIN))
@@ -72,7 +72,7 @@ def network_start(made: Field, views: Views, scene: Scene, settings: Settings) -
         decoder = widened(made.decoder, hidden, generator)
         rows = torch.where((mark > 0)[:, None], feature, noise)
     else:
-        decoder = make_decoder(settings.field.decoder, channels, hidden)
+        decoder = new_decoder(settings.field)
         rows = noise
     rows[-1] = 0
     return replace(

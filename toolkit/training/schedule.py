@@ -1,7 +1,7 @@
 """When a fit goes to a finer lattice, how its step sizes fall, and when it is done: shares of the budget, and a validation split.
 
-Validation views are training views that are kept aside for most of the fit; held-out views are never asked. Once nothing is left to
-decide the validation views are fitted like all others, so that no picture is wasted.
+Validation views are training views that are kept aside for most of the fit; held-out views are never looked at. Once nothing is left to
+decide the validation views are fitted like all others, so that no image is wasted.
 """
 
 from __future__ import annotations
@@ -13,14 +13,13 @@ from dataclasses import field as default
 import numpy as np
 
 from fieldfuse.config import FitSettings
-from fieldfuse.training.depth import FINE, Trust
+from fieldfuse.training.losses import FINE, Rates, Trust
 from fieldfuse.training.start import COARSEST, FINER
-from fieldfuse.training.step import Rates
 
 RUNGS = (0.1, 0.3, 0.6, 0.8, 0.9)  # share of the budget at which each level ends at the latest, from the first one on …
-PARTLY = (0.2, 0.45, 0.7, 0.85, 0.9)  # … of a fit that begins with what is known of depth, and knows a part: what is not takes longer
+PARTLY = (0.2, 0.45, 0.7, 0.85, 0.9)  # … of a fit that begins with what is known of depth, of a part: the rest takes longer
 GUESSED = (0.01, 0.04, 0.12, 0.35, 0.9)  # … of one that begins with a guess, on the coarsest lattice: a hundred steps there make it smooth
-# … of one that no validation views steer, at the latest: nobody tells there when a coarse level gains nothing more.
+# … of one that no validation views steer, at the latest: nothing shows there when a coarse level gains no more.
 UNTOLD = (0.03, 0.12, 0.3, 0.55, 0.9)
 LEVEL_STEPS = 100  # a level is not left, nor pruned, before so many: what has not had time to grow is not empty
 PRUNE_EVERY = 150  # steps
@@ -44,9 +43,9 @@ DROPS = 2  # halvings of the step sizes on plateaus of the finest level, before 
 
 
 def most_rays(pixels: int, validated: bool, passes: float | None) -> float:
-    """Rays after which a fit to so many pixels ends; ∞ where validation views tell how it goes, or `passes` is None.
+    """Rays after which a fit to so many pixels ends; ∞ where validation views show how it goes, or `passes` is None.
 
-    With few views nobody tells, and what comes later is learned by heart.
+    With few views nothing shows it, and what comes later is learned by heart.
     """
     return math.inf if validated or passes is None else max(LEAST_RAYS, passes * pixels)
 
@@ -60,11 +59,11 @@ class Schedule:
         budget: seconds.
         patient: end when the validation views stop improving, before the budget does.
         most_rays: rays after which the fit ends, if the budget has not ended it before.
-        slow_within: distance before a camera up to which things move slowly, working units (`near`).
-        trust: how far the pictures' depth is believed.
+        slow_within: distance before a camera up to which things move slowly, working units (`losses`).
+        trust: how far the images' depth is believed.
         rungs: share of the budget at which each level of the ladder ends at the latest.
         steps, steps_here: taken so far, in all and at this level.
-        wider: times as many rays a step as `FIRST_BATCH` and `fit.max_rays` say.
+        wider: times as many rays a step as `FIRST_BATCH` and `fit.max_rays`.
     """
 
     ladder: list[int]
@@ -122,7 +121,7 @@ class Schedule:
         return min((self.budget - seconds) * rays / max(seconds, 1e-3), self.most_rays - rays)
 
     def decided(self, done: float) -> bool:
-        """Whether the validation views have nothing more to say, so that they can be fitted too."""
+        """Whether nothing is left to decide by the validation views, so that they can be fitted too."""
         return done >= LAST_PRUNE or (self.finest and not self.patient)
 
     def wants_look(self, done: float) -> bool:

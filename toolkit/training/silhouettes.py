@@ -3,12 +3,11 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from typing import Any
 
 import numpy as np
 import torch
-from numba import njit
 
+from fieldfuse.backends.numba.volume import outside_hull
 from fieldfuse.capture.types import Views
 from fieldfuse.nerfusion import compiled
 from fieldfuse.nerfusion.lattice import Lattice
@@ -38,30 +37,13 @@ class Hull:
         if compiled.fits(points) and self.empty.device.type == "cpu":
             out, given = np.empty(len(points), np.bool_), points.detach().contiguous().numpy()
             numbers = np.array([*self.space.centre, self.space.half, self.space.shell, self.space.extent], np.float32)
-            compiled.spread(lambda n: _outside(given[n], self.empty.numpy(), numbers, out[n]), len(points))
+            compiled.spread(lambda n: outside_hull(given[n], self.empty.numpy(), numbers, out[n]), len(points))
             return torch.from_numpy(out)
         contracted = self.space.contract(self.space.normalise(points))
         place = ((contracted + self.space.extent) * (side / (2 * self.space.extent))).floor().long()
         outside = ((place < 0) | (place >= side)).any(1)
         x, y, z = place.clamp(0, side - 1).unbind(1)
         return outside | self.empty[z, y, x]
-
-
-@njit(cache=True, nogil=True, error_model="numpy")
-def _outside(points: Any, empty: Any, numbers: Any, out: Any) -> None:
-    """`Hull` at points (N, 3), into `out`; `numbers` are of the space: centre, half, shell, extent."""
-    side, one = len(empty), np.float32(1)
-    half, shell, extent = numbers[3], numbers[4], numbers[5]
-    voxels = np.float32(side) / (extent + extent)
-    for n in range(len(points)):
-        x, y, z = (points[n, 0] - numbers[0]) / half, (points[n, 1] - numbers[1]) / half, (points[n, 2] - numbers[2]) / half
-        if shell > 0:
-            norm = max(max(abs(x), abs(y)), max(abs(z), one))
-            factor = (one + shell - shell / norm) / norm
-            x, y, z = x * factor, y * factor, z * factor
-        x, y, z = (x + extent) * voxels, (y + extent) * voxels, (z + extent) * voxels
-        inside = x >= 0 and y >= 0 and z >= 0 and x < side and y < side and z < side
-        out[n] = empty[int(z), int(y), int(x)] if inside else True
 
 
 def visual_hull(space: Space, views: Views, device: torch.device | str = "cpu") -> Hull | None:
@@ -86,7 +68,7 @@ def visual_hull(space: Space, views: Views, device: torch.device | str = "cpu") 
 
 
 def inside_silhouettes(field: Field, views: Views, reach: float = WHOLE) -> Field:
-    """The field without the voxels that the alpha of the training views says are empty.
+    """The field without the voxels that the alpha of the training views shows empty.
 
     Args:
         reach: voxels about the middle of each that have to be empty: `WHOLE` keeps all that a silhouette touches.

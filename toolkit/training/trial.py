@@ -35,7 +35,7 @@ class Trial:
     """Short fits to some training frames of a posed capture.
 
     Args:
-        capture: training frames; its points, if it has any, tell where the scene is.
+        capture: training frames; by its points, if it has any, the scene is found.
         validation: (F,) bool frames that are scored.
         settings: of the run.
     """
@@ -48,14 +48,14 @@ class Trial:
         self._made: tuple[Corrections, Views] | None = None
 
     def __call__(self, option: Corrections) -> Array | None:
-        """(V,) PSNR of each validation frame after a fit with what `option` corrects; None: it cannot be told.
+        """(V,) PSNR of each validation frame after a fit with what `option` corrects; None: there is no answer.
 
         Args:
             option: corrections in which validation frames are placed and toned as if they were held out.
         """
         try:
             return self._score(option.on_views(self._views(option)))
-        except (InputError, PoseError):  # whatever is wrong is said where it is used
+        except (InputError, PoseError):  # whatever is wrong is reported where it is used
             return None
 
     def _views(self, option: Corrections) -> Views:

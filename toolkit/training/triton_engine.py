@@ -1,6 +1,6 @@
 """The engine of a fit on CUDA: a step is some thirty launches whose shapes are known beforehand, recorded once and replayed.
 
-What `Optimiser._deferred` does with flat lists of samples is done here ray by ray (`backends/triton/march.py` and `train_*.py` beside it);
+What `torch_engine` does with flat lists of samples is done here ray by ray (`backends/triton/march.py` and `train_*.py` beside it);
 the decoder's layers are products of matrices. Nothing waits for the GPU but a look at every `LOOK`-th step for what was not finite: such
 a step moves nothing.
 """
@@ -12,6 +12,7 @@ import math
 import torch
 import triton
 
+from fieldfuse.backends.constants import RENEW
 from fieldfuse.backends.dispatch import OTHERS_GO_ON
 from fieldfuse.backends.triton.march import BEHIND, COUNTS, JITTER, NOTES, RED, TARGET
 from fieldfuse.backends.triton.train_adam import count_step, learn, move
@@ -23,11 +24,10 @@ from fieldfuse.nerfusion.encoding import DIRECTION, spherical_harmonics
 from fieldfuse.render.field import Field
 from fieldfuse.render.march import BRICK
 from fieldfuse.render.triton_renderer import Tables, TritonRenderer, buffers_for, launch_composite, launch_walk
-from fieldfuse.training.finite import NotFiniteError
-from fieldfuse.training.importance import RENEW, densities, tile_grid
-from fieldfuse.training.rays import Batch, PixelPool
-from fieldfuse.training.step import Rates
-from fieldfuse.training.view import blind
+from fieldfuse.training.losses import Rates
+from fieldfuse.training.nonfinite_policy import NotFiniteError
+from fieldfuse.training.pixels import Batch, PixelPool, densities, tile_grid
+from fieldfuse.training.start import unseen_harmonics
 
 Tensor = torch.Tensor
 SLOTS = 128  # samples of a ray that can get a gradient; lattices so fine that more exceed the threshold come when space is thin no more
@@ -35,7 +35,6 @@ LOOK = 16  # steps from one look at what was not finite to the next, after the f
 DECAY, EPSILON = 0.99, 1e-10  # of both optimisers, as in `LazyAdam`; the decoder's first moment:
 FIRST = 0.9
 ROWS = {"cuda": 64, "cpu": 4096}  # of a program of `move`; Triton's interpreter, which tests use on the CPU, likes few programs
-EAGER = 2  # steps of a new shape before it is recorded: kernels are compiled and libraries made ready
 
 
 class DecoderState:
@@ -46,7 +45,7 @@ class DecoderState:
         self.values = torch.cat([p.detach().reshape(-1) for p in weights])
         self.gradient, self.first, self.second = (torch.zeros_like(self.values) for _ in range(3))
         kept = [torch.ones_like(p.detach()) for p in weights]
-        kept[0][:, -DIRECTION:][:, blind(decoder)] = 0.0
+        kept[0][:, -DIRECTION:][:, unseen_harmonics(decoder)] = 0.0
         self.kept = torch.cat([p.reshape(-1) for p in kept])
         self.parts: list[Tensor] = []
         self.gradients: list[Tensor] = []
@@ -59,8 +58,10 @@ class DecoderState:
             start += p.numel()
 
 
-class TritonOptimiser:
+class TritonEngine:
     """A field under optimisation on CUDA; see `engine.Engine`."""
+
+    EAGER = 2  # steps of a new shape before it is recorded: kernels are compiled and libraries made ready
 
     def __init__(self, field: Field, pool: PixelPool, seed: int = 0, record: bool = True) -> None:
         assert isinstance(field.decoder, Deferred)
@@ -76,13 +77,10 @@ class TritonOptimiser:
         self.total = torch.zeros(1, device=self.device)
         self.rates = torch.zeros(RATES, device=self.device)
         self._staged = [torch.zeros(RATES, pin_memory=self.device.type == "cuda") for _ in range(2 * LOOK)]
-        self._known_bad, self._limit, self.steps = 0, -1, 0
+        self._seen_bad, self._limit, self.steps = 0, -1, 0
         self.renew_rows(field)
 
-    # ---- what a fit asks for ----
-
     def renew_rows(self, field: Field) -> None:
-        """Go on with another field of the same decoder: the rows' state starts afresh."""
         self.field, self.tables = field, Tables(field)
         rows, channels, device = len(field.density_rows), field.feature_rows.shape[1], self.device
         self.g_density, self.second_density, self.touch_steps = (torch.zeros(rows, device=device) for _ in range(3))
@@ -92,30 +90,26 @@ class TritonOptimiser:
         self._shape, self._made = 0, 0
         self._graph: torch.cuda.CUDAGraph | None = None
 
-    def let_go(self) -> None:
-        """Free what belongs to the rows."""
+    def release(self) -> None:
         self._graph, nothing = None, torch.zeros(0, device=self.device)
         self.g_density = self.second_density = self.touch_steps = self.g_feature = self.second_feature = nothing
         self.touched = self.seen = self.visits = nothing
         del self.tables
 
     def go_on_with(self, field: Field) -> None:
-        """Go on with the same rows after pruning; what was seen counts half from now on."""
         self.field = field
         self.tables.renew(field)
         self.seen.mul_(0.5)
         self.visits.mul_(0.5)
 
     def colours(self, origins: Tensor, directions: Tensor) -> Tensor:
-        """(B, 3) colours that the field has now."""
         return TritonRenderer(self.field, len(origins), self.tables)(origins, directions).colour
 
     def sync(self) -> Field:
-        """The field; its rows and its decoder are those that steps move."""
         return self.field
 
     def step(self, rays: int, rates: Rates) -> tuple[float, int]:
-        """One step on `rays` random pixels. The mean squared error that it answers is that of the last look; samples are not counted (0).
+        """One step on `rays` random pixels. The mean squared error is that of the last look; samples are not counted (0).
 
         Raises:
             NotFiniteError: one of the last steps was not finite, and moved nothing.
@@ -125,11 +119,11 @@ class TritonOptimiser:
         if self._limit != self.pool.limit:
             self._limit = self.pool.limit
             self.limit.fill_(self._limit)
-        self._tell(rates)
+        self._stage(rates)
         self._room_for(rays)
         if self._graph is not None:
             self._graph.replay()
-        elif self.record and self._made >= EAGER:
+        elif self.record and self._made >= self.EAGER:
             self._capture(rays)
         else:
             self._draw(rays)
@@ -139,9 +133,9 @@ class TritonOptimiser:
         return (self._look() if self.steps <= LOOK or self.steps % LOOK == 0 else math.nan), 0
 
     def step_on(self, batch: Batch, rates: Rates, jitter: Tensor) -> float:
-        """One step on rays that are given, with jitter (B,), as `Optimiser.step`. Answers their mean squared error."""
+        """One step on rays that are given, with jitter (B,), → their mean squared error."""
         count = len(batch.origins)
-        self._tell(rates)
+        self._stage(rates)
         self._room_for(count)
         rays = self.buffers[0]
         rays[:3], rays[3:RED], rays[RED:COUNTS] = batch.origins.T, batch.directions.T, batch.colour.T
@@ -152,8 +146,6 @@ class TritonOptimiser:
         self.inputs[:, self.field.feature_rows.shape[1] :] = spherical_harmonics(batch.directions)
         self._learn(count, remember=False)
         return self._look()
-
-    # ---- the step ----
 
     def _room_for(self, rays: int) -> None:
         """Buffers for steps of so many rays."""
@@ -166,7 +158,7 @@ class TritonOptimiser:
         self.inputs = torch.zeros(rays, channels + DIRECTION, device=device)
         self.g_logits = torch.zeros(rays, 3, device=device)
 
-    def _tell(self, rates: Rates) -> None:
+    def _stage(self, rates: Rates) -> None:
         """The step sizes, to where the kernels read them."""
         staged = self._staged[self.steps % len(self._staged)]
         for place, value in enumerate(told(rates)):
@@ -266,8 +258,8 @@ class TritonOptimiser:
             NotFiniteError: a step since the last look was not finite.
         """
         failed, error = int(self.failed), float(self.total)
-        if failed > self._known_bad:
-            self._known_bad = failed
+        if failed > self._seen_bad:
+            self._seen_bad = failed
             self.seen.nan_to_num_(0.0)
             raise NotFiniteError("the colour error or a gradient is not finite")
         return error

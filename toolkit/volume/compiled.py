@@ -1,6 +1,6 @@
-"""Pruning and refining a lattice on the CPU, compiled: what `edit.py` does with whole tensors, voxel by voxel and only where something is.
+"""Refining a lattice on the CPU, compiled: what `edit.py` does with whole tensors, voxel by voxel and only where something is.
 
-A step to a finer lattice took a fifth of a short fit in tensors. Results equal those of `edit.py` (tests compare them).
+A step to a finer lattice took a fifth of a short fit in tensors.
 """
 
 from __future__ import annotations
@@ -10,49 +10,36 @@ import torch
 
 from fieldfuse.backends.numba import volume as kernels
 from fieldfuse.memory import keep_only
+from fieldfuse.volume.edit import corner_nodes
 from fieldfuse.volume.host import Host, Hosted
 from fieldfuse.volume.topology import Topology
 
 Tensor = torch.Tensor
 
 
-def dilated(topology: Topology, strong: Tensor) -> Tensor:
-    """(M · 512,) bool grown by one voxel in the 26-neighbourhood, within these blocks; `edit.dilate(…, 1, grow=False)`."""
-    out = torch.zeros_like(strong)
-    kernels.dilate(topology.around.numpy(), strong.numpy(), -1, 1, out.numpy())
-    return out
-
-
-def corner_nodes(topology: Topology, occupied: Tensor) -> Tensor:
-    """(M · 512,) bool: lattice corners that at least one occupied voxel touches; `edit.corner_nodes`."""
-    out = torch.zeros_like(occupied)
-    kernels.dilate(topology.around.numpy(), occupied.numpy(), 0, 1, out.numpy())
-    return out
-
-
 def finer_blocks(topology: Topology, occupied: Tensor, ratio: float) -> Tensor:
     """(N, 3) int32 keys of the blocks that a lattice finer by `ratio` needs: they hold children of occupied voxels, or corners of them."""
-    keys = topology.keys.numpy().astype(np.int64)
+    keys = topology.keys.cpu().numpy().astype(np.int64)
     low = np.floor(keys.min(0) * ratio).astype(np.int64) - 1 if len(keys) else np.zeros(3, np.int64)
     high = np.ceil((keys.max(0) + 1) * ratio).astype(np.int64) + 1 if len(keys) else np.zeros(3, np.int64)
     size = high - low + 1
     place = np.zeros((size[2], size[1], size[0]), np.bool_)
-    kernels.mark_blocks(keys, occupied.numpy(), ratio, low, place)
+    kernels.mark_blocks(keys, occupied.cpu().numpy(), ratio, low, place)
     z, y, x = np.nonzero(place)
     return torch.from_numpy(np.stack([x, y, z], 1) + low).int()
 
 
 def refined(
-    topology: Topology, occupied: Tensor, density: Tensor, feature: Tensor, ratio: float, host: Host, voxel_size: float
+    topology: Topology, occupied: Tensor, rows: tuple[Tensor, Tensor], ratio: float, host: Host, voxel_size: float
 ) -> tuple[Hosted, Tensor]:
     """The same field on a lattice that is finer by `ratio`, in rows of the host.
 
     A finer voxel is occupied when its centre lies in an occupied one. Corners of occupied voxels get the trilinear values of the
-    coarser lattice's known corners; all others stay zero, and take no memory where a page of rows has none but such. `density` and
-    `feature` may be the host's: they are looked at before it is asked for rows, which voids what it gave before.
+    coarser lattice's known corners; all others stay zero, and take no memory where a page of rows has none but such. `rows` may be the
+    host's: they are read before it gives others, which voids what it gave before.
 
     Args:
-        density: (M · 512 + 1,), feature: (M · 512 + 1, C): value arrays with the zero row.
+        rows: densities (M · 512 + 1,) and features (M · 512 + 1, C) with the zero row.
         voxel_size: of the finer lattice, working units.
 
     Returns:
@@ -64,22 +51,21 @@ def refined(
     source = known.nonzero().squeeze(1)
     index = torch.full((len(known),), -1, dtype=torch.int32)
     index[source] = torch.arange(len(source), dtype=torch.int32)
-    values = (index.numpy(), density.detach()[source].numpy(), feature.detach()[source].numpy())
+    values = (index.numpy(), *(of.detach()[source].numpy() for of in rows))
     del source
-    hosted = host.allocate(new_keys, feature.shape[1], voxel_size)
+    hosted = host.allocate(new_keys, rows[1].shape[1], voxel_size)
     new = hosted.topology
-    assert new.table is not None and topology.table is not None
     out = torch.zeros(new.zero_row, dtype=torch.bool)
     kernels.mark_children(keys, occupied.numpy(), ratio, new.table.numpy(), *new.table_origin, out.numpy())
     nodes = corner_nodes(new, out)
     into = (hosted.density.numpy(), hosted.feature.numpy())
-    let_go(nodes, hosted.density, hosted.feature)
+    release_unused(nodes, hosted.density, hosted.feature)
     given = nodes.numpy(), 1 / ratio, topology.table.numpy()
     kernels.resample(new.keys.numpy().astype(np.int64), *given, *topology.table_origin, *values, *into)
     return hosted, out
 
 
-def let_go(nodes: Tensor, density: Tensor, feature: Tensor) -> None:
+def release_unused(nodes: Tensor, density: Tensor, feature: Tensor) -> None:
     """Give back the memory of rows that no voxel uses, page by page: of the corners of a block along a surface that is a third and more.
 
     Args:

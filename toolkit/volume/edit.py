@@ -8,22 +8,18 @@ something; the others are never mixed in.
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 
 import torch
 from torch import Tensor
 
 from fieldfuse.backends import dispatch
 from fieldfuse.backends.dispatch import is_cpu
-from fieldfuse.volume.lookup import corners, gather
-from fieldfuse.volume.rows import zero_rows
+from fieldfuse.volume.host import zero_rows
 from fieldfuse.volume.topology import BLOCK, VOXELS, Bounds, Topology, constant
 
 CHUNK = 1024  # blocks at a time …
 COPIED = 128  # … and of those that are copied
-PRUNE_GAMMA = 0.6  # γ, the transmittance above which a voxel is see-through
-PRUNE_SAMPLES = 3  # points along each axis of a voxel, k = 3³, evenly spread
-MODES = ("trilinear", "nearest")
 _ELEMENTS = 2**19  # values gathered at a time by `resample`: about what fits into a core's cache …
 _AT_ONCE = 2**27  # … and on another device
 
@@ -36,10 +32,21 @@ def corner_nodes(topology: Topology, occupied: Tensor) -> Tensor:
 def _pooled(topology: Topology, occupied: Tensor, last: int) -> Tensor:
     """(M · 512,) bool: rows with an occupied row among the offsets −1 … `last` along each axis."""
     width = last + 2
+    if is_cpu(occupied.device):
+        from fieldfuse.backends.numba import volume
+
+        out = torch.zeros_like(occupied)
+        volume.dilate(topology.around.numpy(), occupied.numpy(), -last, 1, out.numpy())
+        return out
     if dispatch.can_use_triton(occupied, dtypes=None):
-        from fieldfuse.backends.triton import blocks as blocks
+        from fieldfuse.backends.triton import blocks
 
         return blocks.pooled(topology, occupied, -1, width)
+    return pooled_in_torch(topology, occupied, width)
+
+
+def pooled_in_torch(topology: Topology, occupied: Tensor, width: int) -> Tensor:
+    """(M · 512,) bool: rows with an occupied row among the offsets −1 … width − 2 along each axis; on any device."""
     padded = torch.cat([occupied, occupied.new_zeros(1)])
     out = torch.empty_like(occupied)
     side = BLOCK + width - 1
@@ -54,7 +61,7 @@ def _pooled(topology: Topology, occupied: Tensor, last: int) -> Tensor:
 
 def _with_reached_blocks(topology: Topology, occupied: Tensor, lowest: int) -> Topology:
     """These blocks, then the absent ones that hold a row one step (from `lowest` to +1 along each axis) beside an occupied row."""
-    if topology.bounds is not None and topology.table is not None:
+    if topology.bounds is not None:
         return _with_marked_blocks(topology, occupied, lowest)
     cube = occupied.view(-1, BLOCK, BLOCK, BLOCK)
     parts = {-1: slice(0, 1), 0: slice(None), 1: slice(BLOCK - 1, BLOCK)}
@@ -69,9 +76,8 @@ def _with_reached_blocks(topology: Topology, occupied: Tensor, lowest: int) -> T
 
 
 def _with_marked_blocks(topology: Topology, occupied: Tensor, lowest: int) -> Topology:
-    """The same by marks in the table, which asks the device once; new blocks in the table's order."""
+    """The same by marks in the table, which reads from the device once; new blocks in the table's order."""
     table = topology.table
-    assert table is not None
     sx, sy, sz = topology.table_size
     # (M, 3, 3, 3) steps: whether a row of a block lies at its low end, anywhere, or at its high end along each axis.
     reaches = occupied.view(-1, BLOCK, BLOCK, BLOCK)
@@ -135,46 +141,8 @@ def _of_blocks(values: Tensor, kept: Tensor, nodes: Tensor) -> Tensor:
     return out
 
 
-def trilinear_density(topology: Topology, density: Tensor) -> Callable[[Tensor, Tensor], Tensor]:
-    """The function that `prune` wants, for densities σ ≥ 0 (M · 512 + 1,) interpolated between lattice corners."""
-
-    def function(cell: Tensor, inside: Tensor) -> Tensor:
-        return gather(density, *corners(topology, cell, inside))
-
-    return function
-
-
-def prune(occupied: Tensor, density: Callable[[Tensor, Tensor], Tensor], voxel_size: float) -> Tensor:
-    """Occupied voxels that are not see-through, after NeRFusion's pruning rule (its section on fine-tuning) made free of scale.
-
-    The paper drops a voxel when the smallest exp(−σ) over k points in it exceeds γ. That depends on the unit of length, so here
-    the voxel's own optical thickness is looked at: dropped when the smallest exp(−σ · voxel_size) exceeds γ.
-
-    Args:
-        density: (N,) int64 voxel rows and (N, 3) places inside them (x, y, z in 0 … 1) → (N,) σ per working unit.
-        voxel_size: working units.
-
-    Returns:
-        (M · 512,) bool, a subset of `occupied`.
-    """
-    cells = occupied.nonzero().view(-1)
-    line = (torch.arange(PRUNE_SAMPLES, device=cells.device) + 0.5) / PRUNE_SAMPLES
-    z, y, x = torch.meshgrid(line, line, line, indexing="ij")
-    points = torch.stack([x, y, z], -1).view(-1, 3)
-    out = torch.zeros_like(occupied)
-    step = max(2**20 // len(points), 1)
-    for start in range(0, len(cells), step):
-        part = cells[start : start + step]
-        sigma = density(part.repeat_interleave(len(points)), points.repeat(len(part), 1)).view(len(part), -1)
-        out[part] = torch.exp(-sigma * voxel_size).amin(1) <= PRUNE_GAMMA
-    return out
-
-
-def split(topology: Topology, occupied: Tensor, rows: Sequence[Tensor], mode: str = "trilinear") -> tuple[Topology, Tensor, list[Tensor]]:
-    """Every voxel into 2×2×2: the same field on a lattice of half the voxel size and the same origin.
-
-    Args:
-        mode: "trilinear" leaves the field as a function unchanged inside occupied voxels; "nearest" is the paper's.
+def split(topology: Topology, occupied: Tensor, rows: Sequence[Tensor]) -> tuple[Topology, Tensor, list[Tensor]]:
+    """Every voxel into 2×2×2: the same function inside occupied voxels, on a lattice of half the voxel size and the same origin.
 
     Returns:
         topology (children in the order of their parents, then blocks that only hold corners), occupancy, and values, which are zero
@@ -190,7 +158,7 @@ def split(topology: Topology, occupied: Tensor, rows: Sequence[Tensor], mode: st
     keys = topology.keys[parent].long() * 2 + octants[octant]
     bounds = None if topology.bounds is None else doubled(*topology.bounds)
     new_topology, new_occupied = with_corner_blocks(Topology(keys, bounds=bounds), child.reshape(-1))
-    out = resample(topology, occupied, rows, new_topology.keys, 0.5, mode)
+    out = resample(topology, occupied, rows, new_topology.keys, 0.5)
     unused = ~corner_nodes(new_topology, new_occupied)
     return new_topology, new_occupied, [_cleared(values, unused) for values in out]
 
@@ -209,9 +177,7 @@ def doubled(low: tuple[int, int, int], high: tuple[int, int, int]) -> Bounds:
     return (2 * ax, 2 * ay, 2 * az), (2 * bx + 2, 2 * by + 2, 2 * bz + 2)
 
 
-def resample(
-    topology: Topology, occupied: Tensor, rows: Sequence[Tensor], new_keys: Tensor, scale: float, mode: str = "trilinear"
-) -> list[Tensor]:
+def resample(topology: Topology, occupied: Tensor, rows: Sequence[Tensor], new_keys: Tensor, scale: float) -> list[Tensor]:
     """Values at the lattice corners of other blocks, on a lattice with the same origin and another voxel size.
 
     Only corners of occupied voxels count; their weights are scaled to sum to 1, so that borders do not fade into what was never
@@ -224,11 +190,9 @@ def resample(
     Returns:
         per value array (N · 512 + 1, …) with the zero row.
     """
-    if mode not in MODES or not 0 < scale < math.inf:
-        raise ValueError(f"mode must be one of {', '.join(MODES)} and scale positive, not {mode!r} and {scale}")
     nodes = corner_nodes(topology, occupied)
-    if mode == "trilinear" and topology.bounds is not None and dispatch.can_use_triton(*rows):  # keys are small there
-        from fieldfuse.backends.triton import blocks as blocks
+    if topology.bounds is not None and dispatch.can_use_triton(*rows):  # keys are small there
+        from fieldfuse.backends.triton import blocks
 
         return blocks.resample(topology, nodes, rows, new_keys, scale)
     row_of_valid = torch.where(nodes, torch.arange(len(nodes), device=nodes.device), topology.zero_row)
@@ -249,7 +213,7 @@ def resample(
         inside = (place - base).float()
         source = row_of_valid[_box_rows(topology, low, side)]  # (n, side³), z-major
         cube = torch.cat([values[source] for values in flat], -1).masked_fill_((source == topology.zero_row)[..., None], 0.0)
-        mixed = _interpolate(cube, source != topology.zero_row, base - low[..., None], inside, side, mode)
+        mixed = _interpolate(cube, source != topology.zero_row, base - low[..., None], inside, side)
         for target, part in zip(out, mixed.split(widths, -1), strict=True):
             target[start * VOXELS : start * VOXELS + len(part)] = part.reshape(-1, *target.shape[1:])
     return out
@@ -277,20 +241,9 @@ def _box_rows(topology: Topology, low: Tensor, side: int) -> Tensor:
     return torch.where(slot < 0, topology.zero_row, slot * VOXELS + inner.view(len(low), -1))
 
 
-def _interpolate(cube: Tensor, known: Tensor, base: Tensor, inside: Tensor, side: int, mode: str) -> Tensor:
+def _interpolate(cube: Tensor, known: Tensor, base: Tensor, inside: Tensor, side: int) -> Tensor:
     """(n, side³, C) values with (n, side³) bool, at the places base + inside (n, 3, 8 along each axis) → (n · 512, C)."""
     count, _, channels = cube.shape
-    if mode == "nearest":
-        best, best_weight = base.new_zeros((count, VOXELS)), inside.new_zeros((count, VOXELS))
-        for dz, dy, dx in ((z, y, x) for z in (0, 1) for y in (0, 1) for x in (0, 1)):
-            cell = ((base[:, 2, :, None, None] + dz) * side + base[:, 1, None, :, None] + dy) * side + base[:, 0, None, None, :] + dx
-            cell = cell.view(count, -1)
-            wx, wy, wz = ((inside[:, axis] if d else 1 - inside[:, axis]) for axis, d in ((0, dx), (1, dy), (2, dz)))
-            weight = (wz[:, :, None, None] * wy[:, None, :, None] * wx[:, None, None, :]).reshape(count, -1)
-            better = known.gather(1, cell) & (weight > best_weight)  # the first of equals stays: the lower corner
-            best, best_weight = torch.where(better, cell, best), torch.where(better, weight, best_weight)
-        best += torch.arange(count, device=best.device)[:, None] * side**3
-        return cube.view(-1, channels)[best.view(-1)].masked_fill_(best_weight.view(-1, 1) == 0, 0.0)
     cube = torch.cat([cube, known[..., None].to(cube.dtype)], -1)
     for axis in (2, 1, 0):  # z, y, x: one linear step along each axis, always on contiguous rows
         cube = cube.view(count, -1, side, side**axis * (channels + 1))

@@ -9,36 +9,29 @@ from __future__ import annotations
 import atexit
 import weakref
 from collections.abc import Mapping
-from dataclasses import dataclass
-from typing import Any, Self
+from typing import Any
 
+import numpy as np
 import open3d as o3d
 import torch
 from torch import Tensor
 from torch.utils import dlpack
 
 from fieldfuse.errors import InputError
+from fieldfuse.memory import keep_only
+from fieldfuse.volume.host import Host, Hosted, TorchHost, plain_rows
 from fieldfuse.volume.topology import BLOCK, VOXELS, Topology
 
-DEFAULT_ATTRIBUTES = {"feature": 16, "density": 1, "occupied": 1}
-LOOKED_AT = 64  # blocks at once, when memory is asked whether it is clean: each value is a byte for a moment
+LOOKED_AT = 64  # blocks at once, when memory is checked for being clean: each value is a byte for a moment
+LINE = 64  # bytes of a cache line
 GROWTH = 1.5  # a table that must grow gets at least this much more room
-
-
-@dataclass(frozen=True)
-class RowsView:
-    """A shared view together with the generation it belongs to."""
-
-    rows: Tensor  # (capacity · 512, C)
-    generation: int
 
 
 class BlockGrid:
     """A growing set of 8×8×8 blocks with float32 attributes.
 
     Buffer slot b of the grid owns rows b·512 … b·512 + 511 of every attribute, z-major inside the block as in `Topology`. Slots are in
-    no order, though the same in every run as long as the table has not grown; `ordered`, `topology`, `gather` and `scatter` work in the
-    order of sorted keys.
+    no order, though the same in every run as long as the table has not grown; `ordered` and `topology` sort by keys.
 
     Args:
         voxel_size: edge of a voxel in working units.
@@ -51,10 +44,10 @@ class BlockGrid:
     """
 
     def __init__(
-        self, voxel_size: float, attributes: Mapping[str, int] | None = None, capacity: int = 1024, device: torch.device | str = "cpu"
+        self, voxel_size: float, attributes: Mapping[str, int], capacity: int = 1024, device: torch.device | str = "cpu"
     ) -> None:
         self.voxel_size = float(voxel_size)
-        self.attributes = dict(DEFAULT_ATTRIBUTES if attributes is None else attributes)
+        self.attributes = dict(attributes)
         self.device = torch.device(device)
         if not self.voxel_size > 0 or not self.attributes or min(self.attributes.values()) < 1:
             raise ValueError("a grid needs a positive voxel size and at least one attribute with at least one channel")
@@ -65,7 +58,7 @@ class BlockGrid:
         self._views: dict[str, Tensor] = {}
         self._lent: list[weakref.ref[Tensor]] = []
         try:
-            host: Any = o3d.t.geometry.VoxelBlockGrid  # its stubs know neither tuples nor plain integers
+            host: Any = o3d.t.geometry.VoxelBlockGrid  # its stubs have neither tuples nor plain integers
             self._host = host(
                 attr_names=tuple(self.attributes),
                 attr_dtypes=(o3d.core.float32,) * len(self.attributes),
@@ -80,8 +73,6 @@ class BlockGrid:
         self._map: Any = self._host.hashmap()
         _OPEN.add(self)
 
-    # ------------------------------------------------------------------------------------------------ size
-
     def __len__(self) -> int:
         """Number of active blocks."""
         return int(self._table().size())
@@ -93,12 +84,8 @@ class BlockGrid:
 
     @property
     def generation(self) -> int:
-        """Rises whenever rows have moved (growth) or were let go (close): views taken before are void."""
+        """Rises whenever rows have moved (growth) or were freed (close): views taken before are void."""
         return self._generation
-
-    def estimate_bytes(self, blocks: int) -> int:
-        """Bytes of the attributes of so many blocks."""
-        return blocks * (VOXELS * 4 * sum(self.attributes.values()) + 64)
 
     def reserve(self, blocks: int) -> None:
         """Make room for at least `blocks` blocks in all. When that moves rows, the generation rises and views are void.
@@ -108,13 +95,11 @@ class BlockGrid:
         """
         if blocks <= self.capacity:
             return
-        self._let_go()
+        self._void_views()
         try:
             self._map.reserve(int(blocks))
         except (RuntimeError, MemoryError) as error:
             raise self._no_memory(blocks) from error
-
-    # ------------------------------------------------------------------------------------------------ keys
 
     def activate(self, keys: Tensor) -> Tensor:
         """Make sure that the blocks (N, 3) exist; new ones hold zeros. Keys may repeat.
@@ -162,14 +147,6 @@ class BlockGrid:
             self._map.erase(self._to_open3d(keys))
         return len(keys)
 
-    def slots(self) -> Tensor:
-        """(M,) int64 active buffer slots, in the order of sorted keys."""
-        return self.ordered()[1]
-
-    def keys(self) -> Tensor:
-        """(M, 3) int32 active keys, sorted by z, then y, then x."""
-        return self.ordered()[0]
-
     def ordered(self) -> tuple[Tensor, Tensor]:
         """(M, 3) int32 active keys sorted by z, then y, then x, and their (M,) int64 buffer slots: the same in every run."""
         if len(self) == 0:
@@ -184,9 +161,7 @@ class BlockGrid:
 
     def topology(self) -> Topology:
         """The active blocks; its slot s is the s-th of `ordered`, not a buffer slot."""
-        return Topology(self.keys())
-
-    # ------------------------------------------------------------------------------------------------ values
+        return Topology(self.ordered()[0])
 
     def rows(self, name: str) -> Tensor:
         """(capacity · 512, C) float32 view that shares Open3D's buffer: writes are seen by both sides.
@@ -204,59 +179,19 @@ class BlockGrid:
             self._lent.append(weakref.ref(view))
         return self._views[name]
 
-    def view(self, name: str) -> RowsView:
-        """`rows` with the generation it belongs to, for code that keeps it across calls."""
-        return RowsView(self.rows(name), self._generation)
-
-    def check(self, view: RowsView) -> Tensor:
-        """The view's rows, if they are still the grid's.
-
-        Raises:
-            RuntimeError: the grid grew or was closed since.
-        """
-        if view.generation != self._generation:
-            raise RuntimeError("this view of the grid is void, because its rows have moved since; take a new one with rows()")
-        return view.rows
-
-    def gather(self, name: str) -> Tensor:
-        """(M · 512 + 1, C) copy of an attribute in `topology` order, with the zero row at the end."""
-        channels = self.attributes[name]
-        slots = self.slots()
-        out = torch.zeros((len(slots) * VOXELS + 1, channels), device=self.device)
-        blocks = self.rows(name).detach().view(-1, VOXELS * channels)
-        torch.index_select(blocks, 0, slots, out=out[:-1].view(-1, VOXELS * channels))
-        return out
-
-    def scatter(self, name: str, rows: Tensor) -> None:
-        """Write (M · 512, C) or (M · 512 + 1, C) values in `topology` order back into the grid."""
-        channels = self.attributes[name]
-        slots = self.slots()
-        if rows.shape not in ((len(slots) * VOXELS, channels), (len(slots) * VOXELS + 1, channels)):
-            raise ValueError(f"{name} wants {len(slots) * VOXELS} rows of {channels}, not {tuple(rows.shape)}")
-        values = rows.detach()[: len(slots) * VOXELS].to(self.device, torch.float32).reshape(-1, VOXELS * channels)
-        self.rows(name).detach().view(-1, VOXELS * channels).index_copy_(0, slots, values)
-
-    # ------------------------------------------------------------------------------------------------ life
-
     def close(self) -> None:
-        """Let go of all memory, views included. Called at exit for grids still open: Open3D complains about longer held buffers and
+        """Free all memory, views included. Called at exit for grids still open: Open3D complains about longer held buffers and
         fails the exit status."""
-        self._let_go()
+        self._void_views()
         self._map = self._host = None
         _OPEN.discard(self)
-
-    def __enter__(self) -> Self:
-        return self
-
-    def __exit__(self, *exception: object) -> None:
-        self.close()
 
     def _table(self) -> Any:
         if self._map is None:
             raise RuntimeError("this grid is closed")
         return self._map
 
-    def _let_go(self) -> None:
+    def _void_views(self) -> None:
         """Void every view lent so far, so that its old memory is freed and its use fails."""
         self._views.clear()
         for reference in self._lent:
@@ -276,7 +211,7 @@ class BlockGrid:
         return o3d.core.Tensor.from_dlpack(keys.__dlpack__())
 
     def _no_memory(self, blocks: int) -> InputError:
-        size = self.estimate_bytes(int(blocks)) / 2**30
+        size = blocks * VOXELS * 4 * sum(self.attributes.values()) / 2**30
         return InputError(f"there is not enough memory for a volume of {blocks} blocks ({size:.1f} GB); choose a lower resolution")
 
 
@@ -294,3 +229,51 @@ _OPEN: weakref.WeakSet[BlockGrid] = weakref.WeakSet()
 def _close_all() -> None:
     for grid in list(_OPEN):
         grid.close()
+
+
+def host_for(device: torch.device | str) -> Host:
+    """Open3D's hash map where this Open3D can use the device. The packages for the CPU cannot use CUDA: there rows are plain tensors."""
+    device = torch.device(device)
+    return GridHost(device) if device.type == "cpu" or o3d.core.cuda.is_available() else TorchHost(device)
+
+
+class GridHost:
+    """Rows inside Open3D's hash map, shared without a copy. One grid at a time: a finer level replaces the coarser one."""
+
+    def __init__(self, device: torch.device | str = "cpu") -> None:
+        self.device = torch.device(device)
+        self.grid: BlockGrid | None = None
+
+    def allocate(self, keys: Tensor, channels: int, voxel_size: float) -> Hosted:
+        blocks = len(keys)
+        self.close()
+        # One spare block holds the zero row, so the table never grows and the views stay good. It gives `_aligned` room, too.
+        self.grid = BlockGrid(voxel_size, {"feature": channels, "density": 1}, capacity=blocks + 1, device=self.device)
+        slots = self.grid.activate(keys)
+        if blocks and int(slots.max()) != blocks - 1:  # a fresh table hands out its first slots; otherwise its order is not ours to use
+            return plain_rows(self.grid.topology(), channels)
+        ordered = torch.empty_like(keys)
+        ordered[slots] = keys
+        feature, density = (_aligned(self.grid.rows(name), blocks * VOXELS) for name in ("feature", "density"))
+        return Hosted(Topology(ordered), density[:, 0], feature)
+
+    def close(self) -> None:
+        if self.grid is None:
+            return
+        for name in self.grid.attributes if self.device.type == "cpu" else ():
+            rows = self.grid.rows(name).numpy()
+            keep_only(rows, np.zeros(len(rows), np.bool_))  # at once, though the void rows may still be referenced: they read as zero
+        self.grid.close()
+        self.grid = None
+
+
+def _aligned(buffer: Tensor, rows: int) -> Tensor:
+    """(R, C) rows of Open3D's → (rows + 1, C) of the same memory from its first cache line on, and the zero row.
+
+    Open3D's memory begins 16 bytes after such a line, so each row of 16 features would lie in two of them, which costs a step of a fit 6 to
+    10%. Open3D is asked for blocks here and looks at no values, so it does not matter that its own rows begin elsewhere.
+    """
+    buffer[rows : rows + LINE] = 0  # what rows reach of the spare block
+    skip = -buffer.data_ptr() % LINE // buffer.element_size()
+    channels = buffer.shape[1]
+    return buffer.view(-1)[skip : skip + (rows + 1) * channels].view(rows + 1, channels)

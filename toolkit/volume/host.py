@@ -1,19 +1,28 @@
-"""Where the rows of a field live while it is fitted: in Open3D's `VoxelBlockGrid` (`grid_host.GridHost`) or in plain torch tensors.
+"""Where the rows of a field live while it is fitted: in Open3D's `VoxelBlockGrid` (`grid.GridHost`) or in plain torch tensors.
 
-Fitting asks its host for rows and never knows which it got, so it also runs on machines that carry torch alone.
+Fitting works on rows of either, so it also runs on machines that carry torch alone.
 """
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 from typing import Protocol
 
 import torch
 
-from fieldfuse.volume.rows import zero_rows
+from fieldfuse import memory
 from fieldfuse.volume.topology import Topology
 
 Tensor = torch.Tensor
+
+
+def zero_rows(shape: tuple[int, ...], device: torch.device | str = "cpu", dtype: torch.dtype = torch.float32) -> Tensor:
+    """Zeros; on the CPU those that are never written take no memory (`memory.pages`)."""
+    device, count = torch.device(device), math.prod(shape)
+    if device.type != "cpu" or count == 0:
+        return torch.zeros(shape, dtype=dtype, device=device)
+    return torch.frombuffer(memory.pages(count * dtype.itemsize), dtype=dtype).view(shape)
 
 
 @dataclass(frozen=True)
@@ -25,6 +34,12 @@ class Hosted:
     feature: Tensor  # (M · 512 + 1, C)
 
 
+def plain_rows(topology: Topology, channels: int) -> Hosted:
+    """Zeroed rows for blocks, as ordinary tensors on their device."""
+    size = topology.zero_row + 1
+    return Hosted(topology, zero_rows((size,), topology.device), zero_rows((size, channels), topology.device))
+
+
 class Host(Protocol):
     """Gives rows for blocks; what it gave before is void afterwards."""
 
@@ -33,7 +48,7 @@ class Host(Protocol):
         ...
 
     def close(self) -> None:
-        """Let go of the memory; rows given before are void."""
+        """Free the memory; rows given before are void."""
         ...
 
 
@@ -44,9 +59,7 @@ class TorchHost:
         self.device = torch.device(device)
 
     def allocate(self, keys: Tensor, channels: int, voxel_size: float) -> Hosted:
-        topology = Topology(keys.to(self.device))
-        size = topology.zero_row + 1
-        return Hosted(topology, zero_rows((size,), self.device), zero_rows((size, channels), self.device))
+        return plain_rows(Topology(keys.to(self.device)), channels)
 
     def close(self) -> None:
-        """Nothing to do: torch frees what nobody holds."""
+        """Nothing to do: torch frees what is not referenced."""

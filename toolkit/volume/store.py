@@ -11,10 +11,13 @@ import json
 import math
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any
 
 import numpy as np
 import torch
+from pydantic import Field as Bounded
+from pydantic import TypeAdapter, ValidationError
+from pydantic_core import from_json
 from safetensors import SafetensorError, safe_open
 from safetensors.torch import save_file
 from torch import Tensor
@@ -23,7 +26,7 @@ from fieldfuse import memory
 from fieldfuse.camera import Similarity
 from fieldfuse.errors import FieldfuseError, InputError, OutputError, all_lines, first_line
 from fieldfuse.files import atomic_path
-from fieldfuse.volume.rows import zero_rows
+from fieldfuse.volume.host import zero_rows
 from fieldfuse.volume.topology import MAX_TABLE_CELLS, VOXELS
 
 VERSION = 1
@@ -177,9 +180,33 @@ class _Unusable(Exception):
     """Why a field is refused: the middle of a sentence."""
 
 
+_Number = Annotated[float, Bounded(gt=-1e30, lt=1e30)]  # products of two stay finite
+_Positive = Annotated[float, Bounded(gt=0, lt=1e30)]
+_Triple = tuple[_Number, _Number, _Number]
+
+
+@dataclass
+class _Similarity:
+    scale: _Positive
+    rotation: tuple[_Triple, _Triple, _Triple]
+    translation: _Triple
+
+
+@dataclass
+class _Header:
+    """The metadata of a file."""
+
+    version: int
+    voxel_size: _Positive
+    origin: _Triple
+    working_from_input: _Similarity
+    config: dict[str, Any]
+    meta: dict[str, Any]
+
+
 def _checked(tensors: dict[str, Tensor], text: str) -> FieldFile:
     """A `FieldFile` from tensors as they lie in the file and the metadata's JSON, or `_Unusable`."""
-    information = _information(text)
+    header = _header(text)
     for name, dtypes in _DTYPES.items():
         if name not in tensors:
             raise _Unusable(f"its tensor {name!r} is missing")
@@ -210,7 +237,7 @@ def _checked(tensors: dict[str, Tensor], text: str) -> FieldFile:
             raise _Unusable(f"its decoder tensor {name[:40]!r} has the type {tensor.dtype}")
         if not all(bool(torch.isfinite(part).all()) for part in tensor.reshape(-1).split(AT_ONCE)):
             raise _Unusable(f"its tensor {name[:40]!r} holds values that are not finite")
-    return FieldFile(keys, unpack_bits(packed), nodes, features, density, decoder, **information)
+    return FieldFile(keys, unpack_bits(packed), nodes, features, density, decoder, **header)
 
 
 def _check_keys(keys: Tensor) -> None:
@@ -227,52 +254,29 @@ def _check_keys(keys: Tensor) -> None:
         raise _Unusable("it holds a block twice")
 
 
-def _information(text: str) -> dict[str, Any]:
+def _header(text: str) -> dict[str, Any]:
     """The metadata's JSON as arguments of `FieldFile`."""
     if len(text) > MAX_METADATA_BYTES:
         raise _Unusable("its metadata is too large")
     try:
-        data = json.loads(text, parse_constant=_refuse_constant)
-    except (ValueError, RecursionError) as error:
+        data = from_json(text, allow_inf_nan=False)
+    except ValueError as error:
         raise _Unusable("its metadata is not valid JSON") from error
     if not isinstance(data, dict) or type(data.get("version")) is not int:
         raise _Unusable("its metadata has no version")
     if data["version"] != VERSION:
-        raise _Unusable(f"its format has version {str(data['version'])[:20]} and only version {VERSION} is read")
-    similarity = data.get("working_from_input")
-    if not isinstance(similarity, dict) or not isinstance(data.get("config"), dict) or not isinstance(data.get("meta"), dict):
-        raise _Unusable("its metadata is incomplete")
-    scale = _numbers(similarity.get("scale"), (), "scale")
-    rotation = _numbers(similarity.get("rotation"), (3, 3), "rotation")
-    translation = _numbers(similarity.get("translation"), (3,), "translation")
-    voxel_size = _numbers(data.get("voxel_size"), (), "voxel size")
-    if not scale > 0 or not voxel_size > 0:
-        raise _Unusable("its scale or voxel size is not positive")
+        raise _Unusable(f"its format has version {data['version'] % 10**9} and only version {VERSION} is read")
+    try:
+        header = TypeAdapter(_Header).validate_json(text, strict=True)
+    except ValidationError as error:
+        first = error.errors(include_url=False)[0]
+        raise _Unusable(f"its {'.'.join(map(str, first['loc']))} is not one ({first['msg'].lower()})") from error
+    similarity = header.working_from_input
+    rotation = np.array(similarity.rotation, np.float64)
     if np.abs(rotation.T @ rotation - np.eye(3)).max() > 1e-4 or np.linalg.det(rotation) < 0:
         raise _Unusable("its similarity does not hold a rotation")
-    return {
-        "version": VERSION,
-        "voxel_size": float(voxel_size),
-        "origin": tuple(_numbers(data.get("origin"), (3,), "origin").tolist()),
-        "working_from_input": Similarity(float(scale), rotation, translation),
-        "config": data["config"],
-        "meta": data["meta"],
-    }
-
-
-def _numbers(value: Any, shape: tuple[int, ...], name: str) -> np.ndarray:
-    """`value` as float64 of exactly this shape, finite and of moderate size (so that products of two stay finite)."""
-    items = np.array(value, dtype=object)
-    if items.shape != shape or any(type(item) not in (int, float) for item in items.reshape(-1)):
-        raise _Unusable(f"its {name} is not made of {math.prod(shape)} numbers")
-    array = np.array(value, dtype=np.float64)
-    if not np.all(np.abs(array) < 1e100):
-        raise _Unusable(f"its {name} is out of range")
-    return array
-
-
-def _refuse_constant(name: str) -> float:
-    raise ValueError(f"{name} is not JSON")
+    working = Similarity(similarity.scale, rotation, np.array(similarity.translation, np.float64))
+    return {**vars(header), "working_from_input": working}
 
 
 def pack_bits(occupied: Tensor) -> Tensor:

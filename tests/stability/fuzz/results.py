@@ -90,22 +90,22 @@ def make_results(root: Path) -> None:
 def _report(root: Path) -> dict[str, Any]:
     """What `fieldfuse.pipelines.summary` gathers of the files in `root`."""
     from fieldfuse.evaluation.report import report_data
-    from fieldfuse.pipelines import kept
+    from fieldfuse.pipelines import schemas
 
-    scores = kept.read_kept(root / "evaluation.json", kept.EVALUATION)
-    effects = kept.read_kept(root / "effects.json", kept.EFFECTS)
-    network = kept.read_kept(root / "network.json", kept.NETWORK)
+    scores = schemas.read_checked(root / "evaluation.json", schemas.EVALUATION)
+    effects = schemas.read_checked(root / "effects.json", schemas.Effects)
+    network = schemas.read_checked(root / "network.json", schemas.Network)
     return report_data(
         {
             "capture": {"kind": "transforms", "frames": 8, "width": 48, "height": 36},
             "poses": {"source": "given", "registered": 8, "total": 8, "models": [8], "missing": []},
-            "warnings": kept.read_kept(root / "fit_notes.json", kept.NOTES),
-            "notes": [describe_matching(kept.read_kept(root / "fit_matched.json", kept.MATCHED))],
+            "warnings": schemas.read_checked(root / "fit_notes.json", schemas.NOTES),
+            "notes": [describe_matching(schemas.read_checked(root / "fit_matched.json", schemas.Matched))],
             "evaluation": {name: scores.get(name) for name in ("field", "tsdf")} | {"network": {**(scores.get("field") or {}), **network}},
             "effects": {name: effects[name] for name in ("effects", "seconds", "looked_at")},
             "baseline": scores.get("nearest_image"),
-            "timeline": kept.read_kept(root / "timeline.json", kept.TIMELINE),
-            "export_facts": kept.read_export_facts(root / "exports" / "facts.json"),
+            "timeline": schemas.read_checked(root / "timeline.json", schemas.TIMELINE),
+            "export_facts": schemas.read_export_facts(root / "exports" / "facts.json"),
             "exports": [{"path": "mesh.ply", "bytes": 10}],
             "stages": [{"name": "field", "seconds": 1.0, "peak_memory_mb": 100.0, "cached": False}],
             "field": {"voxel_size": 0.1, "blocks": 4, "voxels": 100, "bytes": 1000},
@@ -120,7 +120,7 @@ def read_results(root: Path, number: int) -> None:
     from fieldfuse.evaluation.pictures import Pictures
     from fieldfuse.evaluation.report_page import render_page
     from fieldfuse.evaluation.terminal import report_text
-    from fieldfuse.pipelines.effects_table import effects_facts
+    from fieldfuse.pipelines.info import effects_facts
 
     data = _report(root)
     str(report_text(data))
@@ -196,11 +196,11 @@ def read_measured(root: Path, number: int) -> None:
     from fieldfuse.evaluation.compare import compare_data
     from fieldfuse.evaluation.terminal import comparison_text
     from fieldfuse.evaluation.tradeoff import tradeoff_data
-    from fieldfuse.pipelines import kept
+    from fieldfuse.pipelines import schemas
     from fieldfuse.pipelines.tradeoff_sweep import rows_at
 
     def compared() -> None:
-        found = kept.read_kept(root / "compare" / "scores.json", kept.COMPARED)
+        found = schemas.read_checked(root / "compare" / "scores.json", schemas.CompareScores)
         methods = [
             {"key": key, "title": key, "score": found["scores"].get(key), "geometry": (found["geometry"] or {}).get(key)}
             for key in ("field", "tsdf")

@@ -13,7 +13,7 @@ from fieldfuse.evaluation.sphere import around, lens, sphere_field
 from fieldfuse.render.color_backprojection import COLOURS, MOST, recoloured
 from fieldfuse.render.composite import RAW_MAX
 from fieldfuse.render.sky import sky_colours
-from fieldfuse.training.behind import sky_behind
+from fieldfuse.training.background_sh import sky_behind
 from tests.stability.hard.errors import absolute, not_finite
 from tests.stability.hard.within import Within
 

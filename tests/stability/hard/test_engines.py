@@ -23,7 +23,9 @@ OPACITY = 1e-6
 def both(field: Field, origins: Tensor, directions: Tensor, threshold: float) -> dict[str, Tensor]:
     """(B, 5) colour, distance and opacity by each engine."""
     slow = render_rays(field, origins, directions, threshold)
-    fast = NumbaRenderer(field, 1).render(origins, directions, threshold)
+    renderer = NumbaRenderer(field, 1)
+    renderer.threshold = threshold
+    fast = renderer.render(origins, directions)
     return {"torch": torch.cat([slow.colour, slow.distance[:, None], slow.opacity[:, None]], 1), "compiled": fast}
 
 
@@ -67,7 +69,7 @@ def test_nothing(within: Within) -> None:
     """Nothing to see: no rays, rays that miss, a field without voxels."""
     field = small_field(1)
     origins, directions = aimed_rays(20, 5)
-    empty = replace(field, occupied=torch.zeros_like(field.occupied)).settled()
+    empty = replace(field, occupied=torch.zeros_like(field.occupied)).packed()()
     for what, seen, ways in (("missing", field, -directions), ("no voxels", empty, directions)):
         for name, values in both(seen, origins, ways, 1e-3).items():
             apart = float((values[:, :3] - field.background).abs().max())

@@ -13,8 +13,9 @@ from torch import Tensor
 from fieldfuse.errors import InputError
 from fieldfuse.render.field import Field, density
 from fieldfuse.render.rays import render_rays
-from fieldfuse.training.step import Optimiser, Rates
-from fieldfuse.volume.edit import corner_nodes, erase_empty_blocks, prune, resample, split, trilinear_density, with_corner_blocks
+from fieldfuse.training.losses import Rates
+from fieldfuse.training.torch_engine import TorchEngine
+from fieldfuse.volume.edit import corner_nodes, erase_empty_blocks, resample, split, with_corner_blocks
 from fieldfuse.volume.lookup import corners, gather
 from fieldfuse.volume.topology import VOXELS, Topology
 from tests.stability.hard.errors import absolute, by_size, not_finite, refused
@@ -46,17 +47,17 @@ def read(topology: Topology, occupied: Tensor, values: Tensor, place: Tensor) ->
     return gather(values, *corners(topology, row, (place - cell).float())), held
 
 
-def split_errors(seed: int, mode: str) -> dict[str, float]:
+def split_errors(seed: int) -> dict[str, float]:
     """A split volume against the one before, at random places of it."""
     topology, occupied, values = sparse_volume(seed)
-    finer, finer_occupied, (finer_values,) = split(topology, occupied, [values], mode)
+    finer, finer_occupied, (finer_values,) = split(topology, occupied, [values])
     cells = occupied.nonzero().squeeze(1)
     pick = cells[torch.randint(len(cells), (3000,), generator=torch.Generator().manual_seed(seed))]
     place = lattice(topology)[pick].double() + torch.rand(3000, 3, dtype=torch.float64) * 0.998 + 0.001
     before, _ = read(topology, occupied, values, place)
     after, held = read(finer, finer_occupied, finer_values, 2 * place)
     return {
-        "value in occupied voxels": by_size(after, before) if mode == "trilinear" else 0.0,
+        "value in occupied voxels": by_size(after, before),
         "occupied places lost": float((~held).sum()),
         "voxels that are not eight times as many": abs(float(finer_occupied.sum()) - 8 * float(occupied.sum())),
         "values that are not finite": not_finite(finer_values),
@@ -65,26 +66,9 @@ def split_errors(seed: int, mode: str) -> dict[str, float]:
 
 def test_trilinear_split(within: Within) -> None:
     """A trilinear split leaves the field as it was."""
-    errors = split_errors(3, "trilinear")
+    errors = split_errors(3)
     for name, error in errors.items():
         within(name, error, 1e-6 if name.startswith("value in") else 0.0)
-
-
-def test_nearest_split(within: Within) -> None:
-    """A nearest split copies, eight to one."""
-    topology, occupied, values = sparse_volume(5)
-    finer, finer_occupied, (finer_values,) = split(topology, occupied, [values], "nearest")
-    used = corner_nodes(finer, finer_occupied).nonzero().squeeze(1)
-    known = {tuple(value) for value in values.tolist()}
-    foreign = sum(tuple(value) not in known for value in finer_values[used].tolist())
-    even = used[(lattice(finer)[used] % 2 == 0).all(1)]
-    parent = lattice(finer)[even] // 2
-    slot, local = topology.find(parent >> 3), parent & 7
-    row = slot * VOXELS + (local[:, 2] * 8 + local[:, 1]) * 8 + local[:, 0]
-    within("values that no parent has", float(foreign), 0.0)
-    within("values on the parents' lattice", absolute(finer_values[even], values[row]), 0.0)
-    for name, error in split_errors(5, "nearest").items():
-        within(name, error, 0.0)
 
 
 def test_resampled(within: Within) -> None:
@@ -102,22 +86,6 @@ def test_resampled(within: Within) -> None:
         within(f"not finite at {scale}", not_finite(other), 0.0)
 
 
-def test_prune_scale(within: Within) -> None:
-    """Pruning does not depend on the unit of length."""
-    topology, occupied, values = sparse_volume(9, share=0.5)
-    sigma = values[:, 0].exp() * 4
-    sigma[-1] = 0
-    kept = prune(occupied, trilinear_density(topology, sigma), 0.1)
-    within("pruned nothing or everything", float(int(kept.sum()) in (0, int(occupied.sum()))), 0.0)
-    for factor in (1e-6, 1e-3, 1e3, 1e6):
-        other = prune(occupied, trilinear_density(topology, sigma / factor), 0.1 * factor)
-        within(f"voxels that differ at ×{factor:g}", float((kept != other).sum()), 2.0)
-    thick = prune(occupied, trilinear_density(topology, torch.full_like(sigma, 1e30)), 0.1)
-    thin = prune(occupied, trilinear_density(topology, torch.zeros_like(sigma)), 0.1)
-    within("opaque voxels dropped", float((thick != occupied).sum()), 0.0)
-    within("empty voxels kept", float(thin.sum()), 0.0)
-
-
 def test_pictures_agree(within: Within) -> None:
     """Pictures before and after a split and a clean-up.
 
@@ -126,7 +94,7 @@ def test_pictures_agree(within: Within) -> None:
     field = replace(small_field(2), fine=16)
     origins, directions = aimed_rays(300, 3)
     before = render_rays(field, origins, directions)
-    settled = render_rays(field.settled(), origins, directions)
+    settled = render_rays(field.packed()(), origins, directions)
     topology, occupied, (raw, features) = split(field.topology, field.occupied, [field.density_rows, field.feature_rows])
     finer = Field(field.space, 64, topology, occupied, raw, features, field.decoder, field.background, field.near, field.fine // 2)
     after = render_rays(finer, origins, directions)
@@ -178,26 +146,28 @@ def test_extreme_file(within: Within, tmp_path: Path) -> None:
 def test_optimiser_state(within: Within) -> None:
     """The optimiser's state survives pruning, and starts afresh at a split."""
     from fieldfuse.training.levels import finer, pruned
-    from fieldfuse.training.rays import Batch
+    from fieldfuse.training.pixels import Batch, PixelPool
     from fieldfuse.volume.host import TorchHost
+    from tests.training.gradients import made_views
 
     field = small_field(3, 0.4)
     origins, directions = aimed_rays(200, 2)
     batch = Batch(origins, directions, torch.rand(200, 3), torch.zeros(200, dtype=torch.int64))
     rates, generator = Rates(0.05, 0.02, 1e-3, 0.01), torch.Generator().manual_seed(0)
-    optimiser = Optimiser(replace(field, density_rows=field.density_rows.clone(), feature_rows=field.feature_rows.clone()))
+    copied = replace(field, density_rows=field.density_rows.clone(), feature_rows=field.feature_rows.clone())
+    optimiser = TorchEngine(copied, PixelPool(made_views()))
     for _ in range(3):
-        optimiser.step(batch, rates, generator)
+        optimiser.step_on(batch, rates, torch.rand(200, generator=generator))
     before = [optimiser.density.state.clone(), optimiser.feature.state.clone(), optimiser.field.density_rows.clone()]
     keep = torch.rand(len(field.occupied), generator=generator) < 0.5
     optimiser.go_on_with(pruned(optimiser.field, keep))
     after = [optimiser.density.state, optimiser.feature.state, optimiser.field.density_rows]
     lost = sum(absolute(new, old) for new, old in zip(after, before, strict=True))
-    optimiser.step(batch, rates, generator)
+    optimiser.step_on(batch, rates, torch.rand(200, generator=generator))
     grown = finer(optimiser.field, optimiser.field.occupied, 2 * field.resolution, TorchHost())
     optimiser.renew_rows(grown)
     fresh = float(optimiser.density.state.abs().sum() + optimiser.feature.state.abs().sum())
-    optimiser.step(batch, rates, generator)
+    optimiser.step_on(batch, rates, torch.rand(200, generator=generator))
     states = optimiser.decoder.state.values()
     decoder = [state[name] for state in states for name in ("exp_avg", "exp_avg_sq")]
     forgotten = min(int(state["step"]) for state in states) < 5 or not all(bool(value.any()) for value in decoder)
@@ -208,8 +178,8 @@ def test_optimiser_state(within: Within) -> None:
 
 
 @FEW
-@given(st.integers(0, 10_000), st.sampled_from(["trilinear", "nearest"]))
-def test_splits(seed: int, mode: str) -> None:
-    errors = split_errors(seed, mode)
+@given(st.integers(0, 10_000))
+def test_splits(seed: int) -> None:
+    errors = split_errors(seed)
     assert errors.pop("value in occupied voxels") < 1e-6
     assert not any(errors.values()), errors

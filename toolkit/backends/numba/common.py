@@ -1,4 +1,4 @@
-"""What the CPU's compiled kernels share: options, constants, the arrays of a field, and asking for memory ahead.
+"""What the CPU's compiled kernels share: options, constants, the arrays of a field, and prefetching memory.
 
 The kernels themselves, one ray through a sparse field in float32 scalars and short rows: `lookup.py` (lattice values),
 `march.py` (samples along a ray), `decode.py` (features to colour).
@@ -46,7 +46,7 @@ X, Y, Z, RAW, TAU, WEIGHT, AFTER, PLACE, ALONG = range(VALUES)
 
 @cast(Any, intrinsic)
 def prefetch(context: Any, array: Any, index: Any) -> Any:
-    """Ask for the cache line of array[index] or array[index, 0] without waiting for it: memory latency is most of what a ray costs.
+    """Prefetch the cache line of array[index] or array[index, 0]: memory latency is most of what a ray costs.
 
     Numba has no prefetch of its own. Without this a fit (fox, 320 pixels, one thread) has 21% fewer rays a second.
     """

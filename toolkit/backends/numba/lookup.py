@@ -7,31 +7,15 @@ from typing import Any
 import numpy as np
 from numba import njit
 
-from fieldfuse.backends.numba.common import INLINE, LEAF, ONE, START, X, Y, Z
+from fieldfuse.backends.numba.common import INLINE, LEAF, ONE, X, Y, Z
 from fieldfuse.backends.numba.rows import mix
 
 X_ROW, Y_ROW, Z_ROW = np.uintp(1), np.uintp(8), np.uintp(64)  # rows from a corner of a block to the next one along each axis
 
 
-@njit(**LEAF)
-def corner_rows(upper: Any, cell: Any, rows: Any) -> None:
-    """The eight lattice corners of voxel `cell` into rows[0 … 7], x fastest; an absent block's corner is the zero row."""
-    slot, local = cell >> 9, cell & 511
-    x, y, z = local & 7, (local >> 3) & 7, local >> 6
-    if x < 7 and y < 7 and z < 7:
-        rows[0], rows[1], rows[2], rows[3] = cell, cell + 1, cell + 8, cell + 9
-        rows[4], rows[5], rows[6], rows[7] = cell + 64, cell + 65, cell + 72, cell + 73
-        return
-    zero_row = upper.shape[0] * 512
-    for corner in range(8):
-        u, v, w = x + (corner & 1), y + ((corner >> 1) & 1), z + (corner >> 2)
-        block = upper[slot, (u >> 3) | ((v >> 3) << 1) | ((w >> 3) << 2)]
-        rows[corner] = min(block * 512 + ((w & 7) * 8 + (v & 7)) * 8 + (u & 7), zero_row)
-
-
 @njit(**INLINE)
-def corner_rows_of(upper: Any, cell: Any, rows: Any, index: Any) -> None:
-    """`corner_rows` into rows[index, 0 … 7]."""
+def corner_rows(upper: Any, cell: Any, rows: Any, index: Any) -> None:
+    """The eight lattice corners of voxel `cell` into rows[index, 0 … 7], x fastest; an absent block's corner is the zero row."""
     slot, local = cell >> 9, cell & 511
     x, y, z = local & 7, (local >> 3) & 7, local >> 6
     if x < 7 and y < 7 and z < 7:
@@ -45,21 +29,13 @@ def corner_rows_of(upper: Any, cell: Any, rows: Any, index: Any) -> None:
         rows[index, corner] = min(block * 512 + ((w & 7) * 8 + (v & 7)) * 8 + (u & 7), zero_row)
 
 
-@njit(**LEAF)
-def corner_weights(x: Any, y: Any, z: Any, weights: Any) -> None:
-    """Trilinear weights of the place (x, y, z) in a voxel, in the order of `corner_rows`."""
-    a, b, c = ONE - x, ONE - y, ONE - z
-    weights[0], weights[1], weights[2], weights[3] = a * b * c, x * b * c, a * y * c, x * y * c
-    weights[4], weights[5], weights[6], weights[7] = a * b * z, x * b * z, a * y * z, x * y * z
-
-
 @njit(**INLINE)
 def raw_density(density: Any, upper: Any, cell: Any, x: Any, y: Any, z: Any) -> Any:
     """Trilinear raw density in voxel `cell`."""
     slot, local = cell >> 9, cell & 511
     u, v, w = local & 7, (local >> 3) & 7, local >> 6
     if u < 7 and v < 7 and w < 7:
-        at = np.uintp(cell)  # what cannot be negative need not be asked whether it is
+        at = np.uintp(cell)  # unsigned, so that no check for negative indices is compiled
         p0, p1, p2, p3 = density[at], density[at + Y_ROW], density[at + Z_ROW], density[at + Y_ROW + Z_ROW]
         at += X_ROW
         q0, q1, q2, q3 = density[at], density[at + Y_ROW], density[at + Z_ROW], density[at + Y_ROW + Z_ROW]
@@ -84,15 +60,8 @@ def raw_density(density: Any, upper: Any, cell: Any, x: Any, y: Any, z: Any) -> 
 
 
 @njit(**LEAF)
-def gather_feature(width: Any, feature: Any, rows: Any, x: Any, y: Any, z: Any, weights: Any, out: Any) -> None:
-    """Trilinear feature of the corners rows (8,) into out[:C]; weights (8,) are left for the caller."""
-    corner_weights(x, y, z, weights)
-    mix(width, feature, rows, weights, START, out)
-
-
-@njit(**LEAF)
 def gather_row(width: Any, feature: Any, rows: Any, values: Any, weights: Any, out: Any, index: Any) -> None:
-    """`gather_feature` of sample `index`: rows, weights (S, 8), values (S, 8), out (S, C).
+    """Trilinear feature of sample `index`, whose corners are in rows (S, 8), into out (S, …)[index, :C], and its weights into (S, 8).
 
     Rows are never taken as arrays of their own inside a loop over samples: each such view is counted, by an atomic operation.
     """

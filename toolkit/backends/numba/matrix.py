@@ -37,7 +37,7 @@ def _tile(
     """out[r, c] = Σ_k left[r, k] right[k, c] for TILE rows and LANES columns; with `add` the old value is kept and added to.
 
     Places are offsets in elements: left_at + r · left_row + k · left_step, right_at + k · right_step + c, out_at + r · out_row + c.
-    The compiler keeps the sums in vector registers, which it does not do for loops over arrays: it cannot tell that they do not overlap.
+    The compiler keeps the sums in vector registers, which it does not do for loops over arrays: it cannot prove that they do not overlap.
     """
 
     def generate(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:

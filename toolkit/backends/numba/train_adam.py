@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from numba import njit
@@ -12,36 +12,29 @@ from fieldfuse.backends.numba import common as K
 ZERO, ONE = K.ZERO, K.ONE
 COUNT, DENSITY, FEATURE = 0, 1, 2  # columns of a row's record: steps, and from where on the second moments are
 MOST_STEPS = 65535  # that are counted
-AHEAD = 8  # rows for which memory is asked before they are needed
+AHEAD = 8  # rows that are prefetched before they are needed
+
+
+class Rows(NamedTuple):
+    """State of the lattice corners that rays have come to, and all threads' sums over the batch at hand."""
+
+    index: Any  # (M · 512 + 1, threads + 1) int32; column 0 is a corner's Adam record, −1: none yet; others: see `Sums`
+    bases: Any  # (threads,) int64
+    records: Any  # (K, C + 2) uint16: steps, and second moments of density and features as bfloat16
+    touched: Any  # (threads, T) int32
+    density: Any  # (threads, T) float32
+    feature: Any  # (threads, T, C) float32
 
 
 @njit(**K.OPTIONS)
 def adam_pass(
-    width: Any,
-    volume: Any,
-    index: Any,
-    bases: Any,
-    records: Any,
-    touched: Any,
-    density_sums: Any,
-    feature_sums: Any,
-    thread: Any,
-    used: Any,
-    given: Any,
-    scales: Any,
-    rates: Any,
-    b2: Any,
-    epsilon: Any,
+    width: Any, volume: Any, rows: Any, thread: Any, used: Any, given: Any, scales: Any, rates: Any, b2: Any, epsilon: Any
 ) -> Any:
-    """Lazy Adam (`adam.LazyAdam`) on rows that thread `thread` touched. A row that several touched is moved by the first of them, with the
-    sum in their order, so that the result depends on the number of threads alone.
+    """Lazy Adam (`torch_engine.LazyAdam`) on rows that thread `thread` touched. A row that several touched is moved by the first of them,
+    with the sum in their order, so that the result depends on the number of threads alone.
 
     Args:
-        index: (M · 512 + 1, threads + 1) int32; column 0 is a row's Adam record, −1: it has none yet; the others, with
-            bases (threads,), are of `train_rays.gradient_pass`.
-        records: (K, C + 2) uint16, of a row its steps, and the second moments of its density and features as bfloat16.
-        touched, density_sums, feature_sums: (threads, …) of all `Gradients`.
-        given: how many records this thread has given to rows so far; threads take turns in the order of records, so that none asks
+        given: how many records this thread has given to rows so far; threads take turns in the order of records, so that none waits for
             another.
         scales: (S,) float32 bias correction sqrt(1 - b2^n) for n steps; the last one beyond.
         rates: (2,) float32 of density and features.
@@ -51,6 +44,7 @@ def adam_pass(
     """
     channels = len(width)
     density, feature = volume.density, volume.feature
+    index, bases, records, touched, density_sums, feature_sums = rows
     c2 = ONE - b2
     threads = index.shape[1] - 1
     for at in range(used):

@@ -1,7 +1,6 @@
 """Gradients of one batch of rays for the paper's decoder, compiled: the twin of `train_rays.gradient_pass`.
 
-Values and gradients are those of `step.Optimiser._per_sample`. Rays are worked on a few at a time, so that all that is known of their
-samples is still in the cache when the gradients come back through it.
+Rays are worked on a few at a time, so that all that was computed of their samples is still in the cache when the gradients come back.
 """
 
 from __future__ import annotations
@@ -13,14 +12,12 @@ from numba import njit
 
 from fieldfuse.backends.constants import FREQUENCIES
 from fieldfuse.backends.numba import common as K
-from fieldfuse.backends.numba.decode_per_sample import BATCH, SAMPLES, Net, Tape, decode_colours, make_tape
-from fieldfuse.backends.numba.march_per_sample import march_ray
 from fieldfuse.backends.numba.matrix import add_outer, product
+from fieldfuse.backends.numba.per_sample import BATCH, RAYS, SAMPLES, Net, Tape, decode_colours, make_tape, march_ray
 from fieldfuse.backends.numba.rows import add_row, put_row
-from fieldfuse.backends.numba.train_common import depth_pull, pixel_ray, slow_near
+from fieldfuse.backends.numba.train_batch import add_ray_terms, near_scale, pixel_ray
 
 F, ZERO, ONE, TWO = K.F, K.ZERO, K.ONE, K.TWO
-RAYS = 64  # rays at a time, when they have few samples
 
 
 class Scratch(NamedTuple):
@@ -55,7 +52,7 @@ def _add_rows(values: Any, count: Any, out: Any) -> None:
 
 @njit(**K.OPTIONS)
 def _encode_backward(width: Any, given: Any, g: Any) -> None:
-    """g[:C] from the gradients g[:11 C] of what `decode_per_sample.encode` wrote: d sin(a v) = a cos(a v), d cos(a v) = -a sin(a v)."""
+    """g[:C] from the gradients g[:11 C] of what `per_sample.encode` wrote: d sin(a v) = a cos(a v), d cos(a v) = -a sin(a v)."""
     c_count = len(width)
     cosines = c_count * FREQUENCIES
     angle = F(np.pi)
@@ -113,19 +110,9 @@ def decoder_backward(width: Any, net: Net, scratch: Scratch, count: Any) -> None
 
 @njit(**K.OPTIONS)
 def ray_backward(
-    space: Any,
-    tape: Tape,
-    first: Any,
-    last: Any,
-    background: Any,
-    target: Any,
-    surface: Any,
-    share: Any,
-    losses: Any,
-    g_logit: Any,
-    g_raw: Any,
+    space: Any, scratch: Scratch, first: Any, last: Any, background: Any, target: Any, surface: Any, share: Any, losses: Any
 ) -> Any:
-    """Loss of one ray whose samples are first … last − 1 of the tape, and its gradients g_logit (S, 3) and g_raw (S,) there.
+    """Loss of one ray whose samples are first … last − 1 of the tape, and its gradients for logits and raw densities there.
 
     Args:
         target: (3,) uint8 colour; surface: distance where the ray ends, 0: unknown; share: what the ray counts in the batch's means.
@@ -133,15 +120,15 @@ def ray_backward(
     Returns:
         mean of squared colour errors.
     """
-    total, total_place = ZERO, ZERO
-    red, green, blue = ZERO, ZERO, ZERO
+    values, colour, g_logit, g_raw = scratch.tape.values, scratch.tape.colour, scratch.g_logit, scratch.g_raw
+    total, total_place, red, green, blue = ZERO, ZERO, ZERO, ZERO, ZERO
     for i in range(first, last):
-        weight = tape.values[i, K.WEIGHT]
+        weight = values[i, K.WEIGHT]
         total += weight
-        total_place += weight * tape.values[i, K.PLACE]
-        red += weight * tape.colour[i, 0]
-        green += weight * tape.colour[i, 1]
-        blue += weight * tape.colour[i, 2]
+        total_place += weight * values[i, K.PLACE]
+        red += weight * colour[i, 0]
+        green += weight * colour[i, 1]
+        blue += weight * colour[i, 2]
     left = ONE - total
     red += left * background[0] - F(target[0]) * F(1 / 255)
     green += left * background[1] - F(target[1]) * F(1 / 255)
@@ -149,42 +136,30 @@ def ray_backward(
     per_value = TWO * K.THIRD * share
     g_red, g_green, g_blue = red * per_value, green * per_value, blue * per_value
     constant = -(g_red * background[0] + g_green * background[1] + g_blue * background[2]) - left * (TWO * losses.opacity * share)
-    spread = F(4) / (F(space.fine) * F(space.resolution))
-    distortion, depth_loss = losses.distortion * share, losses.depth * share
-    before, before_place = ZERO, ZERO
     for i in range(first, last):
-        weight, place = tape.values[i, K.WEIGHT], tape.values[i, K.PLACE]
-        a, b, c = tape.colour[i, 0], tape.colour[i, 1], tape.colour[i, 2]
+        weight, a, b, c = values[i, K.WEIGHT], colour[i, 0], colour[i, 1], colour[i, 2]
         g_logit[i, 0] = weight * g_red * a * (ONE - a)
         g_logit[i, 1] = weight * g_green * b * (ONE - b)
         g_logit[i, 2] = weight * g_blue * c * (ONE - c)
-        after, after_place = total - before - weight, total_place - before_place - weight * place
-        pull = place * (before - after) - (before_place - after_place)
-        g_raw[i] = g_red * a + g_green * b + g_blue * c + constant + TWO * distortion * (pull + weight * spread * K.THIRD)
-        g_raw[i] += depth_loss * depth_pull(tape.values[i, K.ALONG], surface, losses.depth_noise)
-        before += weight
-        before_place += weight * place
+        g_raw[i] = g_red * a + g_green * b + g_blue * c + constant
+    add_ray_terms(space, values, first, last, (total, total_place), share, surface, losses, g_raw)
     # so far ∂L/∂w; ∂L/∂τ_i = T_i e^{-τ_i} g_i - Σ_{j>i} w_j g_j, far to near
     behind = ZERO
-    for back in range(last - first):
-        i = last - 1 - back
-        values = tape.values[i]
+    for i in range(last - 1, first - 1, -1):
         g = g_raw[i]
-        g_raw[i] = (values[K.AFTER] * g - behind) * values[K.TAU] if values[K.RAW] < K.RAW_MAX else ZERO
-        behind += values[K.WEIGHT] * g
-        slow = slow_near(values[K.ALONG], losses.slow_within)
-        g_raw[i] *= slow
+        slow = near_scale(values[i, K.ALONG], losses.slow_within)
+        g_raw[i] = slow * (values[i, K.AFTER] * g - behind) * values[i, K.TAU] if values[i, K.RAW] < K.RAW_MAX else ZERO
+        behind += values[i, K.WEIGHT] * g
         for k in range(3):
             g_logit[i, k] *= slow
     return (red * red + green * green + blue * blue) * K.THIRD
 
 
 @njit(**K.OPTIONS)
-def _scatter(
-    tape: Tape, count: Any, scratch: Scratch, index: Any, base: Any, column: Any, zero_row: Any, gradients: Any, channels: Any, used: Any
-) -> Any:
+def _scatter(width: Any, scratch: Scratch, count: Any, zero_row: Any, sums: Any, used: Any) -> Any:
     """Add gradients of samples to the sums of the lattice corners that they were looked up from → rows touched so far."""
-    touched, density_sums, feature_sums = gradients
+    touched, density_sums, feature_sums, index, column, base = sums
+    tape = scratch.tape
     # How a row begins stands in `train_rays`, too: as one function, even where the compiler puts it in, it costs 6% of that pass.
     for i in range(count):
         g_raw, g_given = scratch.g_raw[i], scratch.g_given[i]
@@ -196,79 +171,52 @@ def _scatter(
             at = np.int64(index[row, column]) - base
             if at >= 0:
                 density_sums[at] += share * g_raw
-                add_row(channels, feature_sums, at, g_given, share)
+                add_row(width, feature_sums, at, g_given, share)
                 continue
             index[row, column] = base + used
             touched[used] = row
             density_sums[used] = share * g_raw
-            put_row(channels, feature_sums, used, g_given, share)
+            put_row(width, feature_sums, used, g_given, share)
             used += 1
     return used
 
 
 @njit(**K.OPTIONS)
 def gradient_pass(
-    space: Any,
-    volume: Any,
-    net: Net,
-    background: Any,
-    pixels: Any,
-    picks: Any,
-    jitter: Any,
-    shares: Any,
-    losses: Any,
-    marks: Any,
-    index: Any,
-    bases: Any,
-    thread: Any,
-    gradients: Any,
-    scratch: Scratch,
-    met: Any,
+    space: Any, volume: Any, net: Net, background: Any, pixels: Any, part: Any, losses: Any, marks: Any, sums: Any, scratch: Scratch
 ) -> Any:
-    """Forward and backward over the rays of pixels `picks`.
-
-    Args:
-        gradients: `touched` (T,) int32, and the sums over the rays of densities (T,) and features (T, C).
-        scratch: its `total` is written.
-        others as in `train_rays.gradient_pass`.
-
-    Returns:
-        rows touched, part of the mean over the batch of squared colour errors, samples decoded.
-    """
-    tape, total = scratch.tape, scratch.total
+    """As `train_rays.gradient_pass`; the sums of the weights' gradients are in the scratch's `total` afterwards."""
+    tape, total, picks = scratch.tape, scratch.total, part.picks
     for array in (total.w1, total.w2, total.w3, total.w4):
         array[:] = ZERO
     for array in (total.b1, total.b2, total.b3, total.b4, total.density, total.density_bias):
         array[:] = ZERO
     zero_row = volume.density.shape[0] - 1
-    rays_of, light, starts = np.empty((1, 6), np.float32), np.empty(5, np.float32), np.empty(RAYS + 1, np.int64)
-    ray = rays_of.reshape(-1)
+    light, starts = np.empty(5, np.float32), np.empty(RAYS + 1, np.int64)
     used, looked, number, error = K.START, K.START, K.START, 0.0
     while number < len(picks):
         begun, samples, rays = number, K.START, K.START
         while number < len(picks) and rays < RAYS and samples < BATCH:
-            pixel_ray(pixels, picks[number], rays_of, K.START)
+            line = pixel_ray(pixels, picks[number])
             starts[rays] = samples
-            kept = march_ray(space, volume, net, tape, samples, ray, jitter[number], losses.stop, losses.threshold, marks, light)
+            jitter = part.jitter[number]
+            kept = march_ray(space, volume, net, tape, samples, line, jitter, losses.stop, losses.threshold, marks, light)
             for i in range(samples, samples + kept):
                 for corner in range(8):
-                    K.prefetch(index, np.int64(tape.rows[i, corner]))
+                    K.prefetch(sums.index, np.int64(tape.rows[i, corner]))
             samples += kept
             looked += int(light[3])
-            if met.shape[0] > 0:
-                met[number, 0], met[number, 1] = light[2], light[3]
+            part.met[number, 0], part.met[number, 1] = light[2], light[3]
             rays += 1
             number += 1
         starts[rays] = samples
         decode_colours(net, tape, samples)
         for r in range(rays):
-            pick = picks[begun + r]
+            pick, share = picks[begun + r], part.shares[begun + r]
             surface = pixels.distance[pick] if pixels.distance.shape[0] > 0 else ZERO
-            arguments = (background, pixels.colour[pick], surface, shares[begun + r], losses, scratch.g_logit, scratch.g_raw)
-            own_error = ray_backward(space, tape, starts[r], starts[r + 1], *arguments)
-            error += own_error * shares[begun + r]
-            if met.shape[0] > 0:
-                met[begun + r, 2] = own_error
+            own_error = ray_backward(space, scratch, starts[r], starts[r + 1], background, pixels.colour[pick], surface, share, losses)
+            error += own_error * share
+            part.met[begun + r, 2] = own_error
         decoder_backward(space.width, net, scratch, samples)
-        used = _scatter(tape, samples, scratch, index, bases[thread], thread + 1, zero_row, gradients, space.width, used)
+        used = _scatter(space.width, scratch, samples, zero_row, sums, used)
     return used, error, looked

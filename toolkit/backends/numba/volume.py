@@ -1,4 +1,5 @@
-"""Pruning and refining a lattice, compiled: voxel by voxel and only where something is. `volume/edit.py` is the reference."""
+"""Lattices, compiled: pruning and refining voxel by voxel where something is (`volume/edit.py` is the reference), distances to what is
+occupied, votes of images with depth, and the visual hull."""
 
 from __future__ import annotations
 
@@ -8,6 +9,43 @@ import numpy as np
 from numba import njit
 
 OPTIONS: dict[str, Any] = {"cache": True, "nogil": True, "error_model": "numpy", "boundscheck": False}
+
+
+@njit(**OPTIONS)
+def chessboard_distance(bricks: Any, most: Any) -> None:
+    """In place: 0 where something is, else `most` → distance along the longest axis, capped; two sweeps are exact for it.
+
+    Each sweep takes rows from four rows that it has been to, many bricks at a time, and then goes along the row.
+    """
+    a, b, c = bricks.shape
+    far, one = np.uint8(most), np.uint8(1)
+    near = np.empty(c + 2, np.uint8)  # the nearest of the four rows, with a margin
+    for sweep in range(2):
+        way = 1 if sweep == 0 else -1
+        for i0 in range(a):
+            i = i0 if sweep == 0 else a - 1 - i0
+            for j0 in range(b):
+                j = j0 if sweep == 0 else b - 1 - j0
+                row = bricks[i, j]
+                near[:] = far
+                for side in range(4):
+                    p, q = (i, j - way) if side == 3 else (i - way, j + side - 1)
+                    if 0 <= p < a and 0 <= q < b:
+                        other = bricks[p, q]
+                        for k in range(c):
+                            here, there = near[k + 1], other[k]
+                            near[k + 1] = there if there < here else here
+                for k in range(c):
+                    left, here, right = near[k], near[k + 1], near[k + 2]
+                    here = left if left < here else here
+                    here = np.uint8((right if right < here else here) + one)
+                    row[k] = here if here < row[k] else row[k]
+                last = far
+                for k0 in range(c):
+                    k = k0 if sweep == 0 else c - 1 - k0
+                    step, here = np.uint8(last + one), row[k]
+                    last = step if step < here else here
+                    row[k] = last
 
 
 @njit(**OPTIONS)
@@ -143,3 +181,62 @@ def resample(
         else:
             for c in range(channels):
                 out_feature[row, c] = 0
+
+
+@njit(**OPTIONS)
+def vote(centres: Any, radius: Any, camera: Any, world: Any, depth: Any, out: Any) -> None:
+    """Add the votes of one image on voxels to out (3, N): unknown, past, here."""
+    fx, fy, cx, cy = camera
+    height, width = depth.shape
+    for i in range(len(centres)):
+        x, y, z = centres[i]
+        far = world[2, 0] * x + world[2, 1] * y + world[2, 2] * z + world[2, 3]
+        reach = 2 * radius[i]
+        if far <= reach:
+            continue
+        u = (world[0, 0] * x + world[0, 1] * y + world[0, 2] * z + world[0, 3]) / far * fx + cx
+        v = (world[1, 0] * x + world[1, 1] * y + world[1, 2] * z + world[1, 3]) / far * fy + cy
+        if not (0 <= u < width and 0 <= v < height):
+            continue
+        there = depth[int(v), int(u)]
+        if not there > 0:
+            out[0, i] += 1
+        elif far < there - reach:
+            out[1, i] += 1
+        elif far <= there + reach:
+            out[2, i] += 1
+
+
+@njit(**OPTIONS)
+def add_points(places: Any, colours: Any, out: Any) -> None:
+    """Add points (P, 3), in voxels, to the corners about them, out (z, y, x, 4): weight, and colours by it."""
+    high, long, wide = out.shape[0] - 1, out.shape[1] - 1, out.shape[2] - 1
+    for i in range(len(places)):
+        x, y, z = places[i]
+        if not (0 <= x < wide and 0 <= y < long and 0 <= z < high):
+            continue
+        left, top, front = int(x), int(y), int(z)
+        for corner in range(8):
+            dx, dy, dz = corner & 1, (corner >> 1) & 1, corner >> 2
+            weight = abs(1 - dx - (x - left)) * abs(1 - dy - (y - top)) * abs(1 - dz - (z - front))
+            node = out[front + dz, top + dy, left + dx]
+            node[0] += weight
+            for channel in range(3):
+                node[channel + 1] += weight * colours[i, channel]
+
+
+@njit(**OPTIONS)
+def outside_hull(points: Any, empty: Any, numbers: Any, out: Any) -> None:
+    """`silhouettes.Hull` at points (N, 3), into `out`; `numbers` are of the space: centre, half, shell, extent."""
+    side, one = len(empty), np.float32(1)
+    half, shell, extent = numbers[3], numbers[4], numbers[5]
+    voxels = np.float32(side) / (extent + extent)
+    for n in range(len(points)):
+        x, y, z = (points[n, 0] - numbers[0]) / half, (points[n, 1] - numbers[1]) / half, (points[n, 2] - numbers[2]) / half
+        if shell > 0:
+            norm = max(max(abs(x), abs(y)), max(abs(z), one))
+            factor = (one + shell - shell / norm) / norm
+            x, y, z = x * factor, y * factor, z * factor
+        x, y, z = (x + extent) * voxels, (y + extent) * voxels, (z + extent) * voxels
+        inside = x >= 0 and y >= 0 and z >= 0 and x < side and y < side and z < side
+        out[n] = empty[int(z), int(y), int(x)] if inside else True

@@ -78,7 +78,6 @@ def _resample(
 def resample(topology: Topology, nodes: Tensor, rows: Sequence[Tensor], new_keys: Tensor, scale: float) -> list[Tensor]:
     """`edit.resample`, trilinear, of float32 rows; `nodes`: (M · 512,) bool, the corners that count."""
     table = topology.table
-    assert table is not None
     nodes, keys, out = nodes.view(torch.uint8), new_keys.contiguous(), []
     for values in rows:
         flat = values.reshape(len(values), -1).contiguous()

@@ -153,7 +153,7 @@ def walk(
                     full += weight
                     strongest = tl.where(weight > peak, cell, strongest)
                     peak = tl.maximum(peak, weight)
-                # Within a sample's interval its weight counts as spread evenly (`rays.median_distance`).
+                # Within a sample's interval its weight counts as spread evenly (`rays._median_distance`).
                 middle = alive & (light > 0.5) & (after <= 0.5)
                 within = (light - 0.5) / tl.maximum(light - after, 1e-12) - 0.5
                 median = tl.where(middle, distance + within * (end - t) / FINE, median)

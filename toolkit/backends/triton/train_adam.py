@@ -1,4 +1,4 @@
-"""Both optimisers of a step on CUDA: lazy Adam on the rows that it touched, Adam on the decoder. `adam.py` is the reference."""
+"""Both optimisers of a step on CUDA: lazy Adam on the rows that it touched, Adam on the decoder; `torch_engine.py` is the reference."""
 
 from __future__ import annotations
 

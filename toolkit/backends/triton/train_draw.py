@@ -1,4 +1,4 @@
-"""The draw of a step's pixels on CUDA, by the errors of their tiles, and their rays. `importance.py` and `rays.py` are the reference."""
+"""The draw of a step's pixels on CUDA, by the errors of their tiles, and their rays. `training/pixels.py` is the reference."""
 
 from __future__ import annotations
 

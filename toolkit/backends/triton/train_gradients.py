@@ -1,4 +1,4 @@
-"""The loss of a step on CUDA, and its gradients for rays and for rows. `step.py`, `composite.py` and `depth.py` are the reference.
+"""The loss of a step on CUDA, and its gradients for rays and for rows. `torch_engine.py`, `composite.py` and `losses.py` are the reference.
 
 Gradients of rows are summed by atomic additions, so two fits with the same seed differ in last digits.
 """
@@ -37,7 +37,7 @@ HUGE = tl.constexpr(3e38)  # what is not smaller is not finite
 def judge(
     rays, sums, logits, g_logits, tiles, error, total, rates, count, stride, REMEMBER: tl.constexpr, B: tl.constexpr,
 ):  # fmt: skip
-    """The squared error of rays, and its gradient for what they composite (`Optimiser._deferred`)."""
+    """The squared error of rays, and its gradient for what they composite (`render.rays.shade`)."""
     ray = tl.program_id(0) * B + tl.arange(0, B)
     on = ray < count
     opacity = tl.load(sums + C_OPACITY * stride + ray, mask=on, other=0.0)

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 import triton.language as tl
 
 if TYPE_CHECKING:
-    from fieldfuse.training.step import Rates
+    from fieldfuse.training.losses import Rates
 
 
 R_DENSITY, R_FEATURE, R_DECODER, R_DISTORTION, R_OPACITY, R_DEPTH, R_NOISE, R_SLOW = (tl.constexpr(v) for v in range(8))

@@ -10,7 +10,7 @@ from typing import Annotated, Any
 
 from pydantic import Field
 
-from fieldfuse.checked import NotNegative, Positive, PositiveNumber, Share, checked, flat, one_of, put, read_yaml
+from fieldfuse.config import NotNegative, Positive, PositiveNumber, Share, checked, flat, one_of, put, read_yaml
 from fieldfuse.errors import InputError, brief
 
 LEAST_SIDE = 16  # pixels; sides are rounded to multiples of 8, and less than one would be no picture

@@ -7,8 +7,8 @@ import torch
 from fieldfuse.backends.dispatch import to_device_async
 from fieldfuse.nerfusion.losses import Traced
 from fieldfuse.nerfusion.training.rays import TargetRays
-from fieldfuse.render.differentiable import render_with_gradients
 from fieldfuse.render.field import Field
+from fieldfuse.render.rays import render_with_gradients
 
 Tensor = torch.Tensor
 THRESHOLD = 1e-3  # samples of smaller weight are not decoded; they keep their gradient as obstacles

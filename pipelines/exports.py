@@ -1,0 +1,262 @@
+"""Files for other programs, made of a run's field in the input's frame: points, meshes, textures, cameras, the page and the video."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from dataclasses import asdict, dataclass, field, replace
+from functools import partial
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from fieldfuse import memory
+from fieldfuse.camera import Array
+from fieldfuse.errors import InputError
+from fieldfuse.export.surface import Originals, at_most, surface_of_field, whole_mesh
+from fieldfuse.files import write_json
+from fieldfuse.memory import require_pictures
+from fieldfuse.pipelines.fields import Fitted
+from fieldfuse.pipelines.job import Job
+from fieldfuse.pipelines.pictures import NAME, PAGE, camera_of, orbit_cameras, pictures, put_page
+from fieldfuse.pipelines.prepare import Prepared
+from fieldfuse.pipelines.schemas import read_export_facts
+from fieldfuse.pipelines.stages import CollectingStage
+from fieldfuse.pipelines.surfaces import put_points
+from fieldfuse.pipelines.textured import TEXTURED, put_textured
+from fieldfuse.tone import exposed
+
+if TYPE_CHECKING:
+    from fieldfuse.capture.types import Capture
+    from fieldfuse.poses.result import PoseResult
+
+MESHES = ("ply", "obj", "glb")  # as `export.formats` has them
+TEXTURE = "texture"
+SURFACES = {"points", *MESHES, TEXTURE}
+MOST_TRIANGLES = 2_000_000
+MOST_SPARSE = 20_000  # points that go with exported cameras
+VIDEO_SIDE = 640
+FPS = 30
+REMOVED = "of an earlier field, and removed: {}; `fieldfuse export {} --formats …` makes of this one what the run is not asked for"
+GONE = (
+    "the folder of the capture, {}, is not there any more, and its pictures are needed; put it back (or repeat the run's own command with "
+    "its new place) and run the command again"
+)
+LOST = "the capture's picture {} is not there any more; put it back and run the command again"
+WITHOUT = "the finer field's points and meshes cannot be made: {}, or leave them out with --set 'export.formats=[{}]'"
+
+
+@dataclass(frozen=True)
+class Wish:
+    """What is to be exported.
+
+    Attributes:
+        formats: this time; None: those of the settings, which a later command makes, too.
+        alone: nothing but exports is wanted.
+    """
+
+    formats: list[str] | None = None
+    alone: bool = False
+
+
+@dataclass
+class Exported:
+    """What was written.
+
+    Attributes:
+        facts: of the mesh (triangles, watertight, …) and `notes` on what was left out.
+        whole: False: something was left out for want of the capture's images, and can be made when they are there again.
+    """
+
+    facts: dict[str, Any]
+    files: list[Path] = field(default_factory=list)
+    made: set[str] = field(default_factory=set)  # formats
+    whole: bool = True
+
+
+def export_results(job: Job, ready: Prepared, fitted: Fitted, wish: Wish) -> dict[str, Any]:
+    """Write what is wanted; answers the mesh's facts and notes. Files of the same field that were made before, in other formats, stay.
+
+    Raises:
+        InputError: nothing else is wanted, and none of it could be made.
+    """
+    path = job.folder / "exports" / "facts.json"
+    old, exported = job.stages.record("export"), Exported({})
+
+    def make() -> dict[str, Any]:
+        nonlocal exported
+        fits = job.stages.usable("export")
+        before = read_export_facts(path) if fits else None
+        exported = export_field(job, ready, fitted, wish)
+        stage.whole, facts = exported.whole, exported.facts
+        if wish.alone and not exported.made:
+            raise InputError(f"nothing was exported: {'; '.join(facts['notes'])}")
+        if before is not None and facts["mesh"] is None:
+            facts["mesh"] = before["mesh"]
+        if old is not None and not fits:
+            made = {file.relative_to(job.folder.path).as_posix() for file in exported.files}
+            gone = sorted({Path(name).name for name in set(old.outputs) - made if name.startswith("exports/")} - {path.name})
+            facts["notes"] += [REMOVED.format(", ".join(gone), job.folder.path)] if gone else []
+        return facts
+
+    def save(facts: dict[str, Any]) -> list[Path]:
+        write_json(path, facts)
+        return [path, *exported.files]
+
+    stage = CollectingStage(
+        "export",
+        make=make,
+        save=save,
+        load=partial(read_export_facts, path),
+        inputs=["field", "poses", "scene", "views"],
+        settings=asdict(job.settings.export),
+        version=3,
+        only_part=wish.formats is not None,
+    )
+    return job.run(stage)
+
+
+def export_field(job: Job, ready: Prepared, fitted: Fitted, wish: Wish) -> Exported:
+    """What this command or the settings' `export.formats` name, in the input's frame."""
+    from fieldfuse.export.video import write_video
+
+    views, scene, folder = ready.views, ready.scene, job.folder / "exports"
+    formats = set(job.settings.export.formats if wish.formats is None else wish.formats)
+    notes: list[str] = []
+    out = Exported({"mesh": None, "notes": notes})
+    undone: set[str] = set()
+    for what, names, side in needs_originals(job, formats):
+        gone = missing_originals(job, ready, side)
+        if gone is not None and names - undone:
+            undone |= names
+            notes.append(f"{what} left out: {gone}")
+    out.whole = not undone
+    if surfaces := (formats - undone) & SURFACES:
+        try:
+            out.facts["mesh"], out.files = export_surface(job, ready, fitted, surfaces, notes)
+            undone |= {TEXTURE} - {TEXTURE for path in out.files if path.name == TEXTURED}
+        except InputError as error:
+            undone |= surfaces
+            notes.append(f"points and meshes were left out: {error}")
+    if "cameras" in formats:
+        put_cameras(folder / "cameras", ready.poses, ready.posed, *sparse_points(folder / "points.ply"))
+        out.files += [path for path in sorted((folder / "cameras").rglob("*")) if path.is_file()]
+    if PAGE in formats:
+        try:
+            out.files.append(put_page(job, folder / NAME, fitted.field, views, scene))
+        except InputError as error:
+            undone.add(PAGE)
+            notes.append(f"the page to walk through was left out: {error}")
+    if "video" in formats:
+        _, lenses, around = orbit_cameras(views, scene, job.settings.export.video_frames)
+        job.progress.update(0, len(around), "orbit video")
+        camera = camera_of(job, fitted.field, views, scene, baked=False)
+        lenses = [at_most(lens, VIDEO_SIDE) for lens in lenses]
+        require_pictures(lenses, kept=False, advice="leave video out of export.formats")
+        write_video(folder / "orbit.mp4", pictures(camera, lenses, around, job.progress), FPS)
+        out.files.append(folder / "orbit.mp4")
+    out.made = formats - undone
+    return out
+
+
+def export_surface(
+    job: Job, ready: Prepared, fitted: Fitted, formats: set[str], notes: list[str]
+) -> tuple[dict[str, Any], list[Path]]:
+    """The field's depth at the training cameras, polished by their images as they were taken and fused: points and meshes of the region of
+    interest; `notes` gets a sentence when the texture had to be left out.
+
+    Raises:
+        InputError: the field has no surface.
+    """
+    from fieldfuse.export.mesh import mesh_facts, write_mesh
+
+    folder, exposure = job.folder / "exports", ready.views.exposure
+    originals = Originals(ready.posed, ready.corrections)
+    volume = surface_of_field(fitted.field, ready.views, ready.scene, job.settings, originals, job.progress)
+    memory.give_back()  # what images and depth maps took
+    input_from_working = ready.scene.working_from_input.inverse()
+    written = [put_points(folder / "points.ply", volume.points(), input_from_working, exposure)] if "points" in formats else []
+    whole = whole_mesh(volume, job.settings.export.smooth)
+    del volume
+    mesh = whole.decimated(MOST_TRIANGLES).transformed(input_from_working)
+    mesh = replace(mesh, colours=exposed(mesh.colours, exposure))
+    facts = mesh_facts(mesh)
+    for path in [job.folder / "mesh.ply", *(folder / f"mesh.{suffix}" for suffix in MESHES if suffix in formats)]:
+        write_mesh(path, mesh)
+        written.append(path)
+    if TEXTURE in formats:
+        memory.give_back()
+        try:
+            # People who walk through belong into a texture as little as into the field.
+            shown = ready if fitted.left_out is None else replace(ready, views=fitted.left_out.without(ready.views))
+            written.append(put_textured(job, shown, folder / TEXTURED, whole))
+        except InputError as error:
+            notes.append(f"the texture was left out: {error}")
+    return facts, written
+
+
+def put_cameras(folder: Path, poses: PoseResult, posed: Capture, points: Array | None = None, colours: Array | None = None) -> None:
+    """Cameras as transforms.json and COLMAP text, to be put into the capture's folder: for the images as they lie there.
+
+    Args:
+        points, colours: (P, 3) of a surface in the input's frame, for poses that came without points: programs that start from points
+            need some.
+    """
+    from fieldfuse.capture.convert import all_converted
+    from fieldfuse.capture.select import SELECTED
+    from fieldfuse.capture.stored import stored_cameras
+    from fieldfuse.export.cameras import write_cameras
+
+    made_here = SELECTED in posed.extra or all_converted(posed)  # then the images lie in the run's folder
+    root = posed.frames[0].image.parent.parent if made_here else posed.root
+    # A capture that is reached through a link has its images where the link leads.
+    bases = (root, root.resolve())
+    paths = [frame.image for frame in posed.frames]
+    files = [next((path.relative_to(base).as_posix() for base in bases if path.is_relative_to(base)), str(path)) for path in paths]
+    # Those of the frames that take part, which may be fewer than have a pose.
+    intrinsics, world_from_camera = stored_cameras(posed)
+    if poses.points is not None and len(poses.points):
+        points, colours = poses.points, None
+    write_cameras(folder, files, intrinsics, world_from_camera, points, colours)
+
+
+def sparse_points(path: Path) -> tuple[Array, Array] | tuple[None, None]:
+    """At most `MOST_SPARSE` points (P, 3) of an exported cloud, evenly chosen, and their colours (P, 3) uint8; None where there is none."""
+    import trimesh
+
+    if not path.is_file():
+        return None, None
+    cloud: Any = trimesh.load(path, process=False)
+    chosen = np.linspace(0, len(cloud.vertices) - 1, min(MOST_SPARSE, len(cloud.vertices))).astype(int)
+    return np.asarray(cloud.vertices)[chosen], np.asarray(cloud.colors)[chosen, :3]
+
+
+def needs_originals(job: Job, formats: Iterable[str]) -> list[tuple[str, set[str], int]]:
+    """What of `formats` is made of images as they were taken: how a sentence on it begins, the formats, and the images' long side."""
+    surfaces, export = SURFACES & set(formats), job.settings.export
+    found = [("points and meshes were", surfaces, export.mesh_size), ("the texture was", surfaces & {TEXTURE}, export.texture_size)]
+    return [one for one in found if one[1]]
+
+
+def missing_originals(job: Job, ready: Prepared, side: int) -> str | None:
+    """A sentence when `Originals.at` could not read the training images, since they are gone."""
+    train, shown, posed = np.flatnonzero(~ready.views.test), ready.training, ready.posed
+    if Originals(posed).at(train, shown, side)[0] == shown.intrinsics:
+        return None  # the run has them
+    lost = next((path for index in train if not (path := posed.frames[index].image).is_file()), None)
+    if lost is None:
+        return None
+    return LOST.format(lost) if posed.root.is_dir() or lost.is_relative_to(job.folder.path) else GONE.format(posed.root)
+
+
+def require_originals(job: Job, ready: Prepared) -> None:
+    """Before a field is replaced: what the run exports can be made of the next one, too. The run's settings stay as they were, else.
+
+    Raises:
+        InputError: the capture's images are needed for that, and are gone.
+    """
+    formats = job.settings.export.formats
+    for _, _, side in needs_originals(job, formats):
+        if gone := missing_originals(job, ready, side):
+            job.folder.restore()
+            raise InputError(WITHOUT.format(gone, ",".join(name for name in formats if name not in SURFACES)))
