@@ -65,11 +65,11 @@ test test-all: $(VENV)/.installed-test links
 
 stability: $(VENV)/.installed-test
 	$(BIN)/python -m pytest tests/stability/hard --page docs/stability.md
-	$(BIN)/python -m tests.stability.kills --kills 50 --state .kills-state.json --page docs/stability.md
-	$(BIN)/python -m tests.stability.stops --page docs/stability.md
+	$(BIN)/python -m tests.stability kills --page docs/stability.md
+	$(BIN)/python -m tests.stability stops --page docs/stability.md
 
 fuzz: $(VENV)/.installed-test
-	$(BIN)/python -m tests.stability.fuzz --inputs 100000 --state .fuzz-state.json --page docs/stability.md
+	$(BIN)/python -m tests.stability fuzz --page docs/stability.md
 
 lint: ruff types imports
 

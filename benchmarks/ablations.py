@@ -19,10 +19,10 @@ from benchmarks.ground import Inferred, opened
 from fieldfuse.nerfusion.gru import RunningMean
 from fieldfuse.nerfusion.model import NerfusionModel
 from fieldfuse.pipelines.options import Config, ImageSize, Out, Pairs, Quiet, Seed, Source, gather
-from fieldfuse.training.from_network import NetworkOptions, load_networks
+from fieldfuse.training.from_network import load_networks
 
 OF_OPTIONS: dict[str, dict[str, Any]] = {
-    "no pruning": {"gamma": None},
+    "no pruning": {"gamma": 1.0},
     "sweeps alone": {"agreement": False},
     "colours of the fusion": {"recolour": False},
 }
@@ -43,7 +43,7 @@ def ablations(
     (count, *_) = counts_of(views) or [None]
     with opened(source, out, gather(None, config, pairs, image_size=image_size, seed=seed, threads=1), quiet) as ready:
         model, ground = load_networks(ready.job.settings.network.weights, ready.job.settings.device), ready.ground(count)
-        options = NetworkOptions.of(ready.job.settings.network)
+        options = ready.job.settings.network
 
         def run(entry: Row) -> Row:
             with without(model, entry["part"]):

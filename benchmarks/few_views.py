@@ -23,7 +23,7 @@ from fieldfuse.nerfusion.model import NerfusionModel
 from fieldfuse.pipelines.options import Config, ImageSize, Out, Pairs, Quiet, Seed, Source, gather
 from fieldfuse.render.field import Field
 from fieldfuse.training.fit import Begin
-from fieldfuse.training.from_network import NetworkOptions, load_networks
+from fieldfuse.training.from_network import load_networks
 from fieldfuse.training.guided import fit_guided
 from fieldfuse.training.network_start import network_start
 
@@ -94,7 +94,7 @@ class Bench:
     def _inferred(self, views: int) -> tuple[Inferred, Field]:
         """Direct inference, and its field without the second colours."""
         ground = self.grounds[views]
-        inferred = Inferred.of(self.model, ground, NetworkOptions.of(ground.settings.network), self.ready.job.progress)
+        inferred = Inferred.of(self.model, ground, ground.settings.network, self.ready.job.progress)
         return inferred, inferred.inference.field()
 
     def row(self, entry: Row) -> Row:

@@ -14,7 +14,7 @@ import numpy as np
 from fieldfuse.capture.prepare import prepare_views
 from fieldfuse.capture.subset import limited
 from fieldfuse.capture.types import Capture, Views
-from fieldfuse.config import Settings, settings_dict
+from fieldfuse.config import NetworkSettings, Settings, settings_dict
 from fieldfuse.effects.correct import Corrections
 from fieldfuse.evaluation.score import score_views
 from fieldfuse.files import fingerprint
@@ -28,7 +28,7 @@ from fieldfuse.poses.scene import Scene, describe_scene
 from fieldfuse.progress import SILENT, Progress
 from fieldfuse.render.field import Field
 from fieldfuse.render.image import make_renderer, render_view
-from fieldfuse.training.from_network import Inference, NetworkOptions
+from fieldfuse.training.from_network import Inference
 
 SHOWN = ("psnr", "ssim", "lpips", "depth_abs_err")
 
@@ -101,7 +101,7 @@ class Inferred:
     seconds: float
 
     @classmethod
-    def of(cls, model: NerfusionModel, ground: Ground, options: NetworkOptions, progress: Progress = SILENT) -> Inferred:
+    def of(cls, model: NerfusionModel, ground: Ground, options: NetworkSettings, progress: Progress = SILENT) -> Inferred:
         """Fuse the key frames of the training views."""
         began = time.process_time()
         keys = training_key_frames(ground.views, ground.scene, ground.settings)

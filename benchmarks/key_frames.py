@@ -18,13 +18,14 @@ import typer
 from benchmarks.experiment import Experiment, Folder, Row, application, markdown, program, section, show
 from fieldfuse.camera import Array, Intrinsics
 from fieldfuse.capture.types import Views
+from fieldfuse.config import KeyframesSettings
 from fieldfuse.errors import InputError
 from fieldfuse.nerfusion.extras.keyframe_depth import overlapping
-from fieldfuse.nerfusion.fusion import FusionOptions, fuse_views, fusion_lattice
+from fieldfuse.nerfusion.fusion import FusionOptions, fuse_views
 from fieldfuse.nerfusion.keyframes import KeyFrames, select_keyframes
 from fieldfuse.nerfusion.lattice import Lattice
 from fieldfuse.nerfusion.model import NerfusionModel
-from fieldfuse.nerfusion.training.paths import hand_held
+from fieldfuse.nerfusion.training.procedural import hand_held
 from fieldfuse.nerfusion.weights import SHIPPED, load_model
 from fieldfuse.pipelines.console import make_progress
 from fieldfuse.pipelines.job import set_threads
@@ -58,7 +59,7 @@ def key_frames(
     out: Folder = None,
     quiet: Quiet = False,
 ) -> None:
-    """Fuse key frames of a walk through a made-up room, and count them by the second: encoding, sweeps and witnesses included."""
+    """Fuse key frames of a walk through a made-up room, and count them by the second: encoding, depth distributions included."""
     set_threads(threads or os.cpu_count() or 1)
     where = torch.device(choose_device(device or "auto"))
     progress = make_progress(quiet)
@@ -81,11 +82,11 @@ def table(data: Row) -> str:
 
 @dataclass(frozen=True)
 class Walk:
-    """Views along a walk, the key frames among them with their witnesses, and the finest lattice."""
+    """Views along a walk, the key frames among them with others that overlap, and the finest lattice."""
 
     views: Views
     keys: KeyFrames
-    witnesses: list[list[int]]
+    others: list[list[int]]
     lattice: Lattice
 
 
@@ -97,7 +98,7 @@ def walk(key_frames: int, width: int, voxel: float, levels: int, seed: int, devi
         voxel: side of the finest voxels, metres.
 
     Raises:
-        InputError: no clear walk was found, or the lattice cannot be made.
+        InputError: no clear walk was found.
     """
     random = np.random.default_rng(seed)
     scene = random_scene("room", random, texture_bank(0, TEXTURE))
@@ -112,12 +113,14 @@ def walk(key_frames: int, width: int, voxel: float, levels: int, seed: int, devi
     views = Views([f"{n:04d}" for n in range(len(images))], images, [lens] * len(images), poses, np.zeros(len(images), bool))
     seen = np.concatenate([depth[depth > 0] for depth in depths])
     median = float(np.median(seen))
-    keys = select_keyframes(poses, views.intrinsics, median, method="uniform", every=EVERY, most=key_frames)
+    keys = select_keyframes(poses, views.intrinsics, median, KeyframesSettings("uniform", EVERY, key_frames))
     low, high = free.min(0) - 1.0, free.max(0) + 1.0
     half = float((high - low).max() / 2)
     middle, box = (low + high) / 2, (high - low) / 2 / half
     space = Space((float(middle[0]), float(middle[1]), float(middle[2])), half, 0.0, (float(box[0]), float(box[1]), float(box[2])))
-    return Walk(views, keys, overlapping(keys, poses, views.intrinsics, median), fusion_lattice(space, voxel, levels))
+    unit = 8 * 2 ** (levels - 1)
+    lattice = Lattice(space, max(round(2 * space.extent * space.half / voxel / unit), 1) * unit)
+    return Walk(views, keys, overlapping(keys, poses, views.intrinsics, median), lattice)
 
 
 def _path(scene: Scene, random: np.random.Generator, count: int) -> Array:
@@ -137,7 +140,7 @@ def _path(scene: Scene, random: np.random.Generator, count: int) -> Array:
 def key_frame_rates(
     walk: Walk, options: FusionOptions, device: torch.device, repetitions: int, progress: Progress = SILENT
 ) -> Iterator[dict[str, Any]]:
-    """A row for each time that all key frames are fused, encoding, sweeps and witnesses included: key frames a second, milliseconds of
+    """A row for each time that all key frames are fused, encoding, depth distributions included: key frames a second, milliseconds of
     one in the mean and at the 95th percentile, and how much became known. The first row has loading and compiling in it."""
     model = load_model(SHIPPED, device)
     for number in range(repetitions):
@@ -157,7 +160,7 @@ def key_frame_rates(
 def _fused(model: NerfusionModel, walk: Walk, options: FusionOptions, progress: Progress) -> tuple[Any, int, list[float]]:
     seconds, volume = list[float](), None
     before = time.perf_counter()
-    for step in fuse_views(model, walk.views, walk.keys, walk.lattice, options, progress, witnesses=walk.witnesses):
+    for step in fuse_views(model, walk.views, walk.keys, walk.lattice, options, progress, others=walk.others):
         now = time.perf_counter()
         seconds.append(now - before)
         before, volume = now, step.volume if len(seconds) == len(walk.keys.indices) else None

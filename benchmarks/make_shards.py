@@ -17,8 +17,8 @@ from benchmarks.experiment import application, program
 from fieldfuse.camera import Array, Intrinsics
 from fieldfuse.effects.models import encode_srgb
 from fieldfuse.errors import InputError
-from fieldfuse.nerfusion.training.paths import hand_held
-from fieldfuse.nerfusion.training.shards import write_shard
+from fieldfuse.nerfusion.training.procedural import hand_held
+from fieldfuse.nerfusion.training.scenes import write_shard
 from fieldfuse.simulate.eye import eye_of, take
 from fieldfuse.simulate.mesh_scene import MeshScene, load_mesh_scene
 

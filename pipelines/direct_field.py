@@ -56,15 +56,15 @@ def direct_field(
         Interrupted: the user asked to stop.
     """
     from fieldfuse.nerfusion.keyframes import KeyFrames
-    from fieldfuse.training.from_network import NetworkOptions, voxels_to_median
+    from fieldfuse.training.from_network import voxels_to_median
 
     keys = training_key_frames(views, scene, settings)
     if share < 1:
         some = np.unique(np.linspace(0, len(keys.indices) - 1, max(1, round(share * len(keys.indices)))).round().astype(int))
         keys = KeyFrames(keys.indices[some], keys.neighbours[some])
-    options = NetworkOptions.of(settings.network)
-    voxels = (options.voxels or voxels_to_median(views, options.measured)) / voxel_factor
-    inference = steps.direct_inference(views, scene, keys, settings, replace(options, voxels=voxels))
+    network = settings.network
+    voxels = (network.voxels or voxels_to_median(views, network.depth_from == "sensor")) / voxel_factor
+    inference = steps.direct_inference(views, scene, keys, replace(settings, network=replace(network, voxels=voxels)))
     for _ in inference.frames(progress):
         pass
     return DirectField(inference.result(progress, settings.engine), len(keys.indices), inference.lattice.voxel_size)

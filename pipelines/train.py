@@ -42,8 +42,8 @@ def train(
             taken = trainer.run(steps, progress)
         stopped = progress.stopping() and taken < min(steps or settings.total_steps, settings.total_steps)
     if not quiet:
-        if trainer.caution.met:
-            typer.echo(f"note: {trainer.caution.met} steps were not finite and moved nothing, the last at {trainer.caution.last}")
+        if trainer.state.policy.met:
+            typer.echo(f"note: {trainer.state.policy.met} steps were not finite and moved nothing, the last at {trainer.state.policy.last}")
         typer.echo(f"{out / WEIGHTS} ({taken} steps)")
     if stopped:
         raise Interrupted(f"stopped after {taken} steps; go on with --resume")

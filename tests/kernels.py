@@ -5,25 +5,20 @@ from __future__ import annotations
 from concurrent.futures import ProcessPoolExecutor
 from multiprocessing import get_context
 
+from fieldfuse.config import load_settings
+from fieldfuse.progress import SILENT
+from fieldfuse.stereo import fast_mvs
+from fieldfuse.training.engine import warm_up
+
 
 def fits() -> None:
-    from fieldfuse.config import load_settings
-    from fieldfuse.progress import SILENT
-    from fieldfuse.training.engine import warm_up
-
     for decoder in ("deferred", "per_sample"):
-        warm_up(load_settings(pairs=["device=cpu", f"field.decoder={decoder}", "field.channels=16", "field.hidden=16"]), SILENT)
-
-
-def matching() -> None:
-    from fieldfuse.stereo import fast_mvs
-
-    fast_mvs.warm_up()
+        warm_up(load_settings(pairs=["device=cpu", f"field.decoder={decoder}"]), SILENT)
 
 
 def main() -> None:
     with ProcessPoolExecutor(2, get_context("spawn")) as pool:
-        for done in [pool.submit(fits), pool.submit(matching)]:
+        for done in [pool.submit(fits), pool.submit(fast_mvs.warm_up)]:
             done.result()
 
 

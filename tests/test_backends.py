@@ -7,7 +7,7 @@ import pytest
 import torch
 
 from fieldfuse.backends import dispatch
-from fieldfuse.nerfusion.store import _Slots
+from fieldfuse.nerfusion.store import BlockSlots
 
 CPU, CUDA = torch.device("cpu"), torch.device("cuda")
 
@@ -34,15 +34,15 @@ def test_numbers_arrive_on_a_device_whatever_their_layout() -> None:
         assert np.array_equal(found.numpy(), part) and found.numpy().dtype == part.dtype and found.is_contiguous()
 
 
-def test_slots_are_found_by_code() -> None:
-    random, slots, expected = np.random.default_rng(0), _Slots(), dict[int, int]()
+def test_blocks_keep_the_slots_they_once_got() -> None:
+    random, slots, expected = np.random.default_rng(0), BlockSlots(np.zeros((0, 3), np.int32)), dict[tuple[int, ...], int]()
     for _ in range(20):
-        codes = random.permutation(np.unique(random.integers(-50, 500, 30)))
-        found, missing = slots.find(codes)
-        assert found.tolist() == [expected.get(code, -1) for code in codes.tolist()]
-        new = len(expected) + np.arange(len(missing), dtype=np.int32)
-        slots.add(codes[missing], new)
-        expected.update(zip(codes[missing].tolist(), new.tolist(), strict=True))
+        keys = random.permutation(np.unique(random.integers(-3, 5, (30, 3)), axis=0))
+        for key in map(tuple, keys.tolist()):
+            expected.setdefault(key, len(expected))
+        assert slots.find(keys).tolist() == [expected[key] for key in map(tuple, keys.tolist())]
+        assert slots.keys.tolist() == [list(key) for key in expected]
+
 
 
 def test_kernels_name_their_aligned_tensors() -> None:

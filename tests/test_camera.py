@@ -134,13 +134,6 @@ def test_without_a_lens_every_pixel_is_valid_and_its_own() -> None:
         np.testing.assert_allclose(map_y[:, 0], (np.arange(height) + 0.5) * 48 / height - 0.5, atol=1e-4)
 
 
-def test_maps_made_in_strips_are_seamless() -> None:
-    camera = replace(CAMERA, lens=OPENCV, distortion=(-0.2, 0.05))
-    _, whole, _, _ = undistort_maps(camera, 1280, 960)  # several strips
-    jumps = np.abs(np.diff(whole, n=2, axis=0))
-    assert jumps.max() < 1e-3
-
-
 def test_maps_between_two_cameras() -> None:
     other = Intrinsics(100, 80, 90.0, 91.0, 48.0, 41.0, OPENCV, (0.1, -0.02))
     map_x, map_y, valid = resample_maps(other, CAMERA)
@@ -295,14 +288,6 @@ def test_a_similarity_moves_cameras_with_their_points(similarity: Similarity, po
     np.testing.assert_allclose(moved[:3, :3].T @ moved[:3, :3], np.eye(3), atol=1e-9)  # still rigid
     np.testing.assert_allclose(similarity.inverse().poses(moved), pose, atol=1e-6)
     np.testing.assert_allclose(similarity.directions(pose[:3, 2]), moved[:3, 2], atol=1e-9)
-
-
-@given(similarities())
-def test_similarities_survive_json(similarity: Similarity) -> None:
-    back = Similarity.from_dict(json.loads(json.dumps(similarity.to_dict())))
-    assert back.scale == similarity.scale
-    np.testing.assert_array_equal(back.rotation, similarity.rotation)
-    np.testing.assert_array_equal(back.translation, similarity.translation)
 
 
 # ---------------------------------------------------------------------------------------------------- projection, rays

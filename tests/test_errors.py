@@ -36,15 +36,9 @@ def test_a_name_that_no_terminal_can_show(tmp_path, name):
     assert "\x1b" not in said and "unexpected" not in said and not (tmp_path / "out").exists()
 
 
-@given(ANYTHING)
-def test_what_another_library_says_is_short(text):
-    said = first_line(ValueError(text * 200))
-    assert 0 < len(said) <= LONGEST + 2 and len(said.splitlines()) == 1
-
-
-@given(ANYTHING)
-def test_all_lines_of_what_it_says_are_one_and_short(text):
-    said = all_lines(ValueError(text * 200))
+@given(ANYTHING, st.sampled_from([first_line, all_lines]))
+def test_what_another_library_says_is_short(text, quote):
+    said = quote(ValueError(text * 200))
     assert 0 < len(said) <= LONGEST + 2 and len(said.splitlines()) == 1
     assert all_lines(ValueError("sizes:\n  16 of 8 ")) == "sizes: 16 of 8" and all_lines(ValueError()) == "ValueError"
 

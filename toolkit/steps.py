@@ -30,7 +30,7 @@ if TYPE_CHECKING:
     from fieldfuse.poses.points import Features
     from fieldfuse.poses.result import PoseResult
     from fieldfuse.poses.scene import Scene
-    from fieldfuse.training.from_network import Inference, NetworkOptions
+    from fieldfuse.training.from_network import Inference
 
 
 def set_seeds(seed: int) -> None:
@@ -212,14 +212,11 @@ def key_frames(views: Views, scene: Scene, settings: Settings, sharp: bool = Tru
     train = np.flatnonzero(~np.asarray(views.test))
     if len(train) == 0:
         return KeyFrames(np.zeros(0, np.int64), np.zeros((0, 0), np.int64))
-    wanted = settings.keyframes
     return select_keyframes(
         views.world_from_camera[train],
         [views.intrinsics[int(index)] for index in train],
         scene.median_depth,
-        method=wanted.method,
-        most=wanted.most,
-        every=wanted.every,
+        settings.keyframes,
         sharpness=np.array([sharpness(views.images[int(index)]) for index in train]) if sharp else None,
     )
 
@@ -243,14 +240,12 @@ def require_weights(settings: Settings) -> Path:
     return weights
 
 
-def direct_inference(
-    views: Views, scene: Scene, keys: KeyFrames, settings: Settings, options: NetworkOptions | None = None
-) -> Inference:
-    """The networks, ready to fuse key frame after key frame; `options`: other ones than those of the settings."""
-    from fieldfuse.training.from_network import Inference, NetworkOptions, load_networks
+def direct_inference(views: Views, scene: Scene, keys: KeyFrames, settings: Settings) -> Inference:
+    """The networks, ready to fuse key frame after key frame."""
+    from fieldfuse.training.from_network import Inference, load_networks
 
     model = load_networks(require_weights(settings), settings.device)
-    return Inference(model, views, scene, keys, settings.field.background, options or NetworkOptions.of(settings.network))
+    return Inference(model, views, scene, keys, settings.field.background, settings.network)
 
 
 def starts_from_networks(views: Views, settings: Settings) -> bool:

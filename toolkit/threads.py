@@ -7,8 +7,9 @@ done with one.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
-from concurrent.futures import ThreadPoolExecutor
+from collections import deque
+from collections.abc import Callable, Generator, Iterable, Sequence
+from concurrent.futures import Future, ThreadPoolExecutor
 from itertools import count, pairwise
 from typing import TypeVar
 
@@ -50,6 +51,22 @@ def share(work: Callable[[T], R], pieces: Sequence[T], threads: int) -> list[R]:
     if errors:
         raise errors[0]
     return [results[turn] for turn in range(len(pieces))]
+
+
+def in_order(work: Callable[[T], R], pieces: Iterable[T], threads: int) -> Generator[R, None, None]:
+    """`work` of each piece on so many threads, in their order; no more are begun than the threads need. What is left ends with the
+    iterator: close it."""
+    with ThreadPoolExecutor(threads) as pool:
+        begun: deque[Future[R]] = deque()
+        try:
+            for piece in pieces:
+                begun.append(pool.submit(work, piece))
+                if len(begun) > threads:
+                    yield begun.popleft().result()
+            while begun:
+                yield begun.popleft().result()
+        finally:
+            pool.shutdown(cancel_futures=True)
 
 
 def slices(length: int, pieces: int) -> list[slice]:

@@ -111,27 +111,30 @@ FAULTS = (
         "vignetting's power",
         "wrong constant",
         ("(1 + (effect.corner**-0.5 - 1) * radius.square()) ** -2", "(1 + (effect.corner**-0.5 - 1) * radius.square()) ** -1"),
+        ("np.asarray((1 + (corner**-0.5 - 1) * square) ** -2)", "np.asarray((1 + (corner**-0.5 - 1) * square) ** -1)"),
     ),
     fault(
         "rows of a rolling shutter from its start",
         "off by one",
-        ("effect.readout * ((np.arange(height) + 0.5) / height - 0.5)", "effect.readout * ((np.arange(height) + 0.5) / height)"),
+        (".readout * ((np.arange(height) + 0.5) / height - 0.5)", ".readout * ((np.arange(height) + 0.5) / height)"),
     ),
     fault(
         "tangential distortion p1 for p2",
         "swapped arguments",
         ("bent_x = x * radial + 2 * effect.p1 * x * y + effect.p2 *", "bent_x = x * radial + 2 * effect.p2 * x * y + effect.p1 *"),
+        ("bent_x = x * radial + 2 * self.p1 * x * y + self.p2 *", "bent_x = x * radial + 2 * self.p2 * x * y + self.p1 *"),
     ),
     fault(
         "depth noise linear in depth",
         "wrong constant",
-        ("rng.normal(0, 1, z.shape) * effect.sigma * z**2", "rng.normal(0, 1, z.shape) * effect.sigma * z"),
+        (".sigma * z**2", ".sigma * z"),
     ),
     # Stereo
     fault(
         "depth kept although others see through it",
         "dropped guard",
         ("kept = (depth > 0) & (agree >= needed) & (agree > through)", "kept = (depth > 0) & (agree >= needed)"),
+        ("(found.agree >= needed) & (found.agree > found.through)", "(found.agree >= needed)"),
     ),
     fault("correlation without the windows' means", "skipped step", ("(product * part_of - mean[x] * their)", "(product * part_of)")),
     # Volume
@@ -254,9 +257,9 @@ FAULTS = (
         ("seen = inside & (local[:, 2] <= depth[row, column] * (1 + BEHIND)) & (cosine > 0)", "seen = inside & (cosine > 0)"),
     ),
     fault(
-        "COLMAP's cameras counted from zero",
-        "off by one",
-        ("numbers.setdefault(camera, len(numbers) + 1)", "numbers.setdefault(camera, len(numbers))"),
+        "COLMAP's place with the wrong sign",
+        "wrong sign",
+        ("*quaternion(pose[:3, :3]), *pose[:3, 3]]", "*quaternion(pose[:3, :3]), *-pose[:3, 3]]"),
     ),
     # Evaluation
     fault("PSNR in half decibels", "wrong constant", ("float(-10 * np.log10(error))", "float(-20 * np.log10(error))")),
@@ -279,6 +282,7 @@ FAULTS = (
         "simulated depth along the ray",
         "wrong unit",
         ("depth = torch.where(hit, seen.distance * eye.cosine, 0.0)", "depth = torch.where(hit, seen.distance, 0.0)"),
+        ("seen.distance * eye.cosine.repeat(count), 0.0)", "seen.distance, 0.0)"),
     ),
     fault(
         "cylinders without an end",
@@ -287,6 +291,7 @@ FAULTS = (
             "return torch.where(hit & (enter <= leave) & (enter > NEAREST), enter, FAR)",
             "return torch.where(hit & (enter > NEAREST), enter, FAR)",
         ),
+        ("if enter <= leave and NEAREST < reached < best:", "if NEAREST < reached < best:"),
     ),
     fault(
         "people who pass before what stands",
@@ -301,11 +306,13 @@ FAULTS = (
         "steps not made again for other settings",
         "dropped guard",
         ("(trusted or (record.key == key and not record.stopped))", "(trusted or not record.stopped)"),
+        ("return trusted or (record.key == key and not record.stopped)", "return trusted or not record.stopped"),
     ),
     fault(
         "damaged results of a step reused",
         "dropped guard",
         ("if not path.is_file() or path.stat().st_size != size:", "if not path.is_file():"),
+        ("all(path.is_file() and path.stat().st_size == size for", "all(path.is_file() for"),
     ),
     fault("a run written over its own source", "dropped guard", ("if source.resolve() == out.resolve():", "if False:")),
     fault(
@@ -313,7 +320,12 @@ FAULTS = (
         "wrong comparison",
         ("if before.resolve() == source.resolve():", "if before.resolve() != source.resolve():"),
     ),
-    fault("somebody's files in the run's folder", "dropped guard", ("foreign = self._results()", "foreign: list[str] = []")),
+    fault(
+        "somebody's files in the run's folder",
+        "dropped guard",
+        ("foreign = self._results()", "foreign: list[str] = []"),
+        ("if not self._held_run and (foreign := self._results()):", "if (foreign := self._results()) == [None]:"),
+    ),
     fault(
         "renders of the wrong size",
         "wrong comparison",

@@ -154,23 +154,6 @@ def test_a_child_that_hangs_or_is_not_wanted_any_more_is_ended(tmp_path: Path) -
     assert child.end_reason(7) == "failed with exit code 7"
 
 
-def test_what_is_finished_stays_when_the_user_stops(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    progress = ConsoleProgress()
-
-    def run(source: Path, *_: Any) -> dict[str, Any]:
-        if source.name == "b":
-            progress.request_stop()
-        progress.check()
-        return {"state": "refused", "error": "no", "kind": "llff", "poses": None}
-
-    monkeypatch.setattr("benchmarks.captures.run_one", run)
-    with pytest.raises(Interrupted):
-        experiment([tmp_path / name for name in "abc"], plan(tmp_path, seeds=(0,), compare_effects=False), progress).conduct(
-            tmp_path / "out", progress
-        )
-    assert [one["capture"] for one in read_json(tmp_path / "out" / "captures.json")["rows"]] == ["a"]
-
-
 READ = {
     "state": "read", "error": None, "kind": "llff", "poses": "given", "registered": 20, "total": 21, "masks": 0, "psnr": 22.126,
     "nearest_image": 15.04, "seconds": 61.4, "effects": ["motion_blur"], "warnings": [],

@@ -12,10 +12,8 @@ from benchmarks import effects, effects_by_hand, simulated
 from benchmarks.effects import confusion, fits, table
 from benchmarks.simulated import Planned
 from fieldfuse.config import Settings
-from fieldfuse.errors import Interrupted
 from fieldfuse.files import read_json
 from fieldfuse.pipelines.console import ConsoleProgress
-from fieldfuse.progress import Progress
 from tests.pipelines.made import bench
 from tests.pipelines.short import steady
 
@@ -70,18 +68,6 @@ def test_captures_are_filmed_once_and_looked_at_each_time(tmp_path: Path, capsys
 
 
 @pytest.mark.usefixtures("small")
-def test_fits_in_every_mode(tmp_path: Path) -> None:
-    with steady(0.005):
-        data = fits([Planned("plain", "room", 7, ())], tmp_path, 0.5, ["all_off", "all_on"]).conduct(tmp_path, ConsoleProgress())
-    auto, off, on = data["rows"]
-    assert [row["mode"] for row in data["rows"]] == ["auto", "all_off", "all_on"]
-    assert off["on"] == [] and off["effects_seconds"] == 0 and on["effects_seconds"] > 0 and on["psnr"] > 8
-    lines = table(data).splitlines()
-    assert lines[0].startswith("| capture | found | auto, dB | all off, dB | all on, dB |") and lines[-1].startswith("| mean |")
-    assert f"| {auto['canonical']:.2f} | {off['canonical']:.2f} | {on['canonical']:.2f} |" in lines[-1]
-
-
-@pytest.mark.usefixtures("small")
 def test_fits_are_scored_against_canonical_images_and_kept(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     planned = [Planned("drift", "room", 6, (("exposure", "strong"), ("vignetting", "strong")))]
     with steady(0.005):
@@ -94,22 +80,6 @@ def test_fits_are_scored_against_canonical_images_and_kept(tmp_path: Path, monke
     assert again["rows"] == data["rows"] == read_json(tmp_path / "fits-0.7s.json")["rows"]
     with pytest.raises(TypeError):
         fits(planned, tmp_path, 0.8, ["all_off", "known"]).conduct(tmp_path, ConsoleProgress())
-
-
-@pytest.mark.usefixtures("small")
-def test_of_a_fit_that_is_stopped_nothing_is_kept(tmp_path: Path) -> None:
-    class Stopped(Progress):
-        fitting = False
-
-        def update(self, done: float, total: float, note: str = "") -> None:
-            self.fitting = self.fitting or "³" in note
-
-        def stopping(self) -> bool:
-            return self.fitting
-
-    with pytest.raises(Interrupted):
-        fits([Planned("plain", "room", 7, ())], tmp_path, 3, [], Stopped()).conduct(tmp_path, ConsoleProgress())
-    assert not list(tmp_path.glob("fits*"))
 
 
 def test_switched_by_hand(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: Capsys) -> None:

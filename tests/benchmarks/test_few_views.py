@@ -45,16 +45,6 @@ def test_tables_of_few_views_go_on_where_they_stopped(room: Path, tmp_path: Path
     assert "    python -m benchmarks.few_views " in text
 
 
-def test_rows_of_other_settings_do_not_go_into_one_table(room: Path, tmp_path: Path, capsys: Capsys) -> None:
-    out, found = tmp_path / "table", []
-    for side in (48, 32):
-        size = ["--image-size", side, "--set", "effects=off"]
-        answer = bench(capsys, "few_views", room, "--out", out, "--views", "3", "--starts", ",", *size)  # the nearest image alone
-        assert answer.code == 0 and ("of other settings" in answer.err) is (side == 32)
-        found += read_json(out / "few_views.json")["rows"]
-    assert len(found) == 2 and found[0]["psnr"] != found[1]["psnr"]
-
-
 def test_parts_of_the_networks_can_be_switched_off(room: Path, tmp_path: Path, capsys: Capsys) -> None:
     settings = ["--set", "network.voxels=12", "--views", "4"]
     answer = bench(capsys, "ablations", room, "--out", tmp_path / "table", *settings, "--quiet")

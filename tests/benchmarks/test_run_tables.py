@@ -7,7 +7,7 @@ from typing import Any
 
 import pytest
 
-from benchmarks.run_tables import budget_table, is_report, run_table
+from benchmarks.run_tables import budget_table, run_table
 from benchmarks.table import sections
 from fieldfuse.evaluation.tradeoff import tradeoff_data
 from fieldfuse.files import write_json
@@ -61,18 +61,6 @@ def test_a_surface_is_scored_twice() -> None:
     field, surface = rows(run_table([run("/data/kitchen", 27.0, tsdf=17.5)], ["one"]))
     assert field[3:5] == ["30 s, one thread", "27.0"]
     assert surface[3:5] == ["its TSDF", "17.5 (19.5 on the 50% where it has surface)"]
-
-
-def test_bare_photos_are_named_by_what_holds_them() -> None:
-    assert [row[0] for row in rows(run_table([run("/data/fox/images/", 29.5), run("photos", 20.0)], ["one", "two"]))] == [
-        "fox/images",
-        "photos",
-    ]
-
-
-def test_only_reports_are_reports() -> None:
-    assert is_report(run("/data/fox", 29.5))
-    assert not is_report({"rows": []}) and not is_report(None)
 
 
 def test_runs_of_a_budget_become_one_table() -> None:

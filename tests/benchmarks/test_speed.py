@@ -9,8 +9,8 @@ import numpy as np
 import pytest
 
 from benchmarks import speed_cases
-from benchmarks.speed import fit_curves, growth, table, tsdf_frames
-from benchmarks.timing import Case, Timed, compare, exponent
+from benchmarks.speed import fit_curves, table, tsdf_frames
+from benchmarks.timing import Case, Timed, exponent
 from fieldfuse.camera import pixel_grid, rays
 from fieldfuse.evaluation.sphere import CHANNELS, around, lens, sphere_field, sphere_pixels
 from fieldfuse.render.bake import bake
@@ -67,22 +67,6 @@ def test_ratios_are_of_the_clock_that_is_asked_for() -> None:
 def test_growth_is_fitted() -> None:
     sizes = np.array([10.0, 20.0, 40.0])
     assert exponent(list(sizes), list(3 * sizes**1.7)) == pytest.approx(1.7)
-
-
-def test_growth_is_measured_over_rays_and_images(monkeypatch: pytest.MonkeyPatch) -> None:
-    for name, sizes in (("GROWING_RAYS", (64, 256)), ("GROWING_SIDES", (16, 32)), ("GROWING_VIEWS", (4, 8)), ("LATTICE", 32)):
-        monkeypatch.setattr(speed_cases, name, sizes)
-    cases = list(speed_cases.growth_cases(1))
-    assert [case.size for case in cases] == ["64 rays", "256 rays", "16 pixels", "32 pixels", "4 images", "8 images"]
-    assert set(growth(cases)) == {case.name for case in cases}
-    assert [case.units for case in cases[:2]] == [256, 1024]
-
-
-def test_pieces_of_work_are_timed_in_turns() -> None:
-    order: list[str] = []
-    ours, reference = compare(lambda: order.append("a"), lambda: order.append("b"), 2)
-    assert order == ["a", "b", "a", "b", "b", "a"]
-    assert 0 <= ours.wall < 1 and 0 <= reference.processor < 1
 
 
 def test_some_parts_are_measured_and_written(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

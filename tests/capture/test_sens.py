@@ -21,7 +21,7 @@ from fieldfuse.capture.select import select_frames
 from fieldfuse.capture.sens import scan
 from fieldfuse.config import CaptureSettings
 from fieldfuse.errors import InputError
-from fieldfuse.nerfusion.training.datasets.scannet import scannet_folders, scannet_scene
+from fieldfuse.nerfusion.training.scenes import scannet_folders, scannet_scene
 from tests.capture.layouts import OFF_CENTRE, SCANNET_COLOUR, rows, sens_of, whole_centres, write_sens
 from tests.capture.made import eyes, pixel_error, render
 

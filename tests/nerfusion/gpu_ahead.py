@@ -12,8 +12,8 @@ import time
 from collections import Counter, defaultdict
 from dataclasses import replace
 from typing import Any
+from unittest import mock
 
-import numpy as np
 import torch
 import triton
 from triton.backends.compiler import GPUTarget
@@ -22,18 +22,15 @@ from triton.compiler import ASTSource
 from fieldfuse.backends.triton import blocks as blocks_gpu
 from fieldfuse.backends.triton import cast as cast_gpu
 from fieldfuse.backends.triton import coarse_steps as march_gpu
-from fieldfuse.backends.triton import convolution, describe, matching, measured, reading
+from fieldfuse.backends.triton import convolution, depth_reading, local_volume, plane_sweep
 from fieldfuse.backends.triton import feature_lookup as lookup
-from fieldfuse.backends.triton import split as split_gpu
-from fieldfuse.backends.triton import tables as tables_gpu
 from fieldfuse.backends.triton import volumes as volumes_gpu
-from fieldfuse.backends.triton.gru import Step
-from fieldfuse.backends.triton.observe import Observer
-from fieldfuse.nerfusion.cull import all_blocks
+from fieldfuse.nerfusion.cameras import all_blocks
 from fieldfuse.nerfusion.extras.cross_view_consistency import CrossView
-from fieldfuse.nerfusion.extras.plane_sweep import DepthDistribution
-from fieldfuse.nerfusion.head import FieldHead
+from fieldfuse.nerfusion.extras.plane_sweep import CostVolume, DepthDistribution
 from fieldfuse.nerfusion.lattice import LatentVolume, LocalVolume
+from fieldfuse.nerfusion.unproject import KeyFrame
+from fieldfuse.nerfusion.volume_net import FieldHead
 from fieldfuse.simulate.solids import BALL, BOX, CYLINDER, ROOM, Solids, upright
 from fieldfuse.volume.topology import Topology
 from tests.nerfusion.made import SMALL as SIZES
@@ -72,23 +69,25 @@ def sweeps(views: int, planes: int, height: int, width: int, count: int) -> None
     """A sweep and its witnesses."""
     whole = torch.rand(views, 21, height, width)
     seen_by = cameras(views)
-    describe.describe(torch.rand(views, 3, height, width), (0.3, 0.6, 0.1), 0.03)
-    rays, own, inverses = describe.pixels(whole[0], seen_by, (height, width), planes, 0.1, 1.0)
-    matching.costs(list(whole), seen_by, inverses, rays, own, 8.0, 0.6)
+    plane_sweep.patch_descriptors(torch.rand(views, 3, height, width), (0.3, 0.6, 0.1), 0.03)
+    rays, own, inverses = plane_sweep.pixels(whole[0], seen_by, (height, width), planes, 0.1, 1.0)
+    plane_sweep.costs(list(whole), seen_by, inverses, rays, own, 8.0, 0.6)
     cost = torch.rand(height, width, planes).permute(2, 0, 1)
-    matching.semi_global(cost, 0.1, 0.8)
-    table = matching.table(matching.distribution(cost, 0.1, 0.8, 0.05), 0.01, 2)
-    depth = torch.rand(2 * height, width + 3)
-    measured.measured(cost, inverses, depth, (2 * height, 2 * width), [(0, 2 * height), (0.5, width)], 0.01, 0.01, 0.98, 2)
-    for said in (None, cost):
-        matching.decided(cost, said, 0.1, 0.8, 0.05, 0.01, 2)
-    reading.look(torch.rand(count, 3), torch.rand(count), table, seen_by[views - 1], 0.1, 0.01)
-    one = CrossView(seen_by[0], reading.says(table, 4.0, 0.1, 2), 0.1, 0.01)
-    surface = reading.surest(table, rays, inverses, seen_by.positions[0], 0.7)
-    matching.alone(cost, rays, inverses, seen_by[views - 1], 0.1, 0.01, (0.1, 0.8, 0.05), 2, (4.0, 0.1, 2), 0.7)
-    asked = reading.Asked([replace(one, camera=seen_by[k % views]) for k in range(views)])
-    for sums in (None, asked.confirmed(surface)):
-        asked.mean(rays, inverses, seen_by[views - 1], (height, width), ((height + 1) // 2, (width + 1) // 2), sums, 1.0, 0.3)
+    costs = CostVolume(seen_by[views - 1], rays, inverses, 0.1, 0.01, cost)
+    plane_sweep.semi_global(cost, 0.1, 0.8)
+    smoothing = 0.1, 0.8, 0.05
+    table = plane_sweep.table(plane_sweep.smoothed_softmax(cost, *smoothing), 0.01, 2)
+    depth, place = torch.rand(2 * height, width + 3), ((2 * height, 2 * width), [(0, 2 * height), (0.5, width)])
+    depth_reading.table_with_depth(cost, inverses, depth, place, (0.01, 0.01, 0.98), 2)
+    for correction in (None, cost):
+        plane_sweep.table_of_costs(cost, correction, smoothing, 0.01, 2)
+    depth_reading.look(torch.rand(count, 3), torch.rand(count), table, seen_by[views - 1], 0.1, 0.01)
+    one = CrossView(seen_by[0], depth_reading.log_odds(table, 4.0, 0.1, 2), 0.1, 0.01)
+    surface = depth_reading.confident_points(table, rays, inverses, seen_by.positions[0], 0.7)
+    plane_sweep.own_estimate(costs, smoothing, 2, (4.0, 0.1, 2), 0.7)
+    together = depth_reading.Together([replace(one, camera=seen_by[k % views]) for k in range(views)])
+    for sums in (None, together.confirmed(surface)):
+        together.mean(costs, ((height + 1) // 2, (width + 1) // 2), sums, 1.0, 0.3)
 
 
 def volumes(blocks: int) -> None:
@@ -103,23 +102,23 @@ def volumes(blocks: int) -> None:
         convolution.weight_gradient(values, topology.around, torch.rand(topology.zero_row + 1, outside))
     side_by_side = convolution.taps_of(torch.rand(8, 8, 3, 3, 3), torch.rand(8, 8, 3, 3, 3))
     convolution.convolve(torch.rand(topology.zero_row + 1, 16), topology.around, side_by_side, torch.rand(16), mask, True)
-    table, cells = tables_gpu.table(topology.keys, topology.table_origin, topology.table_size)
-    tables_gpu.around(table, cells)
-    tables_gpu.around(table, cells, torch.arange(blocks, dtype=torch.int32), torch.arange(blocks, dtype=torch.int32))
+    table, cells = blocks_gpu.table(topology.keys, topology.table_origin, topology.table_size)
+    blocks_gpu.around(table, cells)
+    blocks_gpu.around(table, cells, torch.arange(blocks, dtype=torch.int32), torch.arange(blocks, dtype=torch.int32))
     blocks_gpu.pooled(topology, mask, 0, 2, True)
     blocks_gpu.resample(topology, mask, [rows], topology.keys.long(), 0.5)
     slots, count = torch.arange(blocks, dtype=torch.int32), torch.rand(topology.zero_row)
     taken = blocks_gpu.take(rows, count, slots, topology)
     blocks_gpu.take(rows, count, slots, topology, (rows, count, topology))
     blocks_gpu.put(rows, count, slots, *taken, mask)
-    split_gpu.split(topology, mask, rows, ((-1, -1, -1), (2 * blocks, 3, 3)), 0.25)
+    blocks_gpu.split(topology, mask, rows, ((-1, -1, -1), (2 * blocks, 3, 3)), 0.25)
     volumes_gpu.settle(rows, rows, slots)
     volumes_gpu.merge(rows, count, rows, count, mask)
     volumes_gpu.surface_cells(topology, rows, count, mask, FieldHead(16, 32, 16), -3.0)
     part = LatentVolume(lattice(), topology, rows, count)
     local = LocalVolume(lattice(), topology, rows, torch.ones(topology.zero_row), rows, count, topology, slots)
     for kind in (torch.float32, torch.bfloat16):
-        step = Step(part, local, 0.1, 16)
+        step = volumes_gpu.Step(part, local, 0.1, 16)
         step.average()
         both, _ = step.beside(kind)
         step.forget(torch.rand(len(both), 32).to(kind), both)
@@ -135,11 +134,13 @@ def corners(views: int, side: int, planes: int) -> None:
     for shell in (0.0, 1.0):
         space = lattice(16, shell)
         keys = all_blocks(space)[:2]
-        observer = Observer(encoded, seen_by, 0.1, 4.0, distribution, (2.0, 0.02, 0.1, 4.0, 0.35, 0.9))
-        observer.choose(space, keys, None)
-        found = observer.choose(space, keys, torch.ones(2 * 512, dtype=torch.bool))
-        found = replace(found, rows=torch.arange(planes), filled=np.ones(2, bool), busy=np.ones(2, bool))
-        observer.observe(space, keys, found, torch.zeros(4, dtype=torch.int32), model.local.project, SIZES.sampled, True, SIZES.channels)
+        frame, topology = KeyFrame(encoded, seen_by, 0.1, 4.0, distribution), Topology(keys, bounds=space.bounds("cpu"))
+        numbers = local_volume.Numbers(2.0, 0.02, 0.1, 0.9, 4.0, 0.35, SIZES.sampled, True, SIZES.channels)
+        found = torch.full((1 + 2 * 512 // local_volume.PART,), 3, dtype=torch.int32)  # as if all corners had been found
+        found[0] = planes
+        for wanted in (None, torch.ones(2 * 512, dtype=torch.bool)):
+            with mock.patch.object(local_volume.torch, "zeros", lambda *_, found=found, **__: found), torch.no_grad():
+                local_volume.local_volume(model.local, frame, space, topology, wanted, numbers)
     step = torch.rand(planes)
     for table in (True, False):
         rows = encoded[0].features.rows.detach().requires_grad_(table)

@@ -3,8 +3,10 @@
 from __future__ import annotations
 
 import numpy as np
+import pytest
 import torch
 
+from fieldfuse.backends import dispatch
 from fieldfuse.camera import Array, Intrinsics
 from fieldfuse.nerfusion.cameras import Cameras
 from fieldfuse.nerfusion.lattice import Lattice
@@ -40,6 +42,11 @@ def pictures(count: int = 3, seed: int = 0, size: tuple[int, int] = (HEIGHT, WID
     generator = torch.Generator().manual_seed(seed)
     coarse = torch.rand((count, 3, size[0] // 4, size[1] // 4), generator=generator)
     return torch.nn.functional.interpolate(coarse, size=size, mode="bilinear", align_corners=False)
+
+
+def off(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Torch computes, and no kernels."""
+    monkeypatch.setattr(dispatch, "can_use_numba", lambda *values: False)
 
 
 def lattice(resolution: int = 32, shell: float = 0.0) -> Lattice:

@@ -3,29 +3,8 @@
 from __future__ import annotations
 
 import torch
-from hypothesis import given, settings
-from hypothesis import strategies as st
 
 from fieldfuse.nerfusion.aggregate import CUES, FLAGS, aggregate, agreement, direction_spread, evidence
-
-
-@settings(max_examples=30, deadline=None)
-@given(st.integers(0, 10**6), st.integers(1, 7))
-def test_against_loops_and_in_any_order(seed: int, views: int) -> None:
-    generator = torch.Generator().manual_seed(seed)
-    values = torch.randn((views, 9, 3), generator=generator, dtype=torch.float64)
-    visible = torch.rand((views, 9), generator=generator) < 0.6
-    visible[0] |= ~visible.any(0)
-    mean, variance, count = aggregate(values, visible)
-    for n in range(9):
-        seen = values[visible[:, n], n]
-        torch.testing.assert_close(mean[n], seen.mean(0))
-        torch.testing.assert_close(variance[n], seen.var(0, unbiased=False), atol=1e-12, rtol=1e-9)
-        assert int(count[n]) == len(seen)
-    order = torch.randperm(views, generator=generator)
-    again = aggregate(values[order], visible[order])
-    torch.testing.assert_close(again[0], mean)
-    torch.testing.assert_close(again[1], variance)
 
 
 def test_one_view_has_variance_exactly_zero_and_a_gradient_that_is_finite() -> None:

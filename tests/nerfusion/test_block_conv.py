@@ -118,35 +118,6 @@ def test_only_what_needs_a_gradient_gets_one_and_inputs_stay_as_they_are() -> No
     assert float(layer.bias.grad[0]) == topology.zero_row and torch.equal(rows, before)
 
 
-def test_start_keeps_the_deviation_through_many_layers() -> None:
-    torch.manual_seed(0)
-    topology, _ = cube(3, 1.0, 0)
-    rows = torch.randn(topology.zero_row + 1, 16)
-    rows[-1] = 0
-    for _ in range(6):
-        rows = torch.relu(BlockConv3d(16, 16)(rows, topology))
-        assert rows[:-1].std(0).mean() > 0.1, "features must not die out from layer to layer"
-
-
-def test_autocast_computes_in_the_reduced_type() -> None:
-    topology, _ = cube(2, 1.0, 0)
-    rows = torch.randn(topology.zero_row + 1, 8)
-    rows[-1] = 0
-    layer = BlockConv3d(8, 8)
-    full = layer(rows.requires_grad_(), topology)
-    full.square().sum().backward()
-    reference, kernel = rows.grad, layer.weight.grad
-    assert reference is not None and kernel is not None
-    rows.grad, layer.weight.grad = None, None
-    with torch.autocast("cpu", dtype=torch.bfloat16):
-        half = layer(rows, topology)
-    assert half.dtype == torch.bfloat16
-    half.float().square().sum().backward()
-    for one, two in ((half.float(), full), (rows.grad, reference), (layer.weight.grad, kernel)):
-        assert one is not None and one.dtype == torch.float32
-        assert float((one - two).detach().norm() / two.detach().norm()) < 0.02
-
-
 def test_shapes_that_do_not_fit() -> None:
     topology, _ = cube(2, 1.0, 0)
     layer = BlockConv3d(4, 4)
@@ -157,17 +128,6 @@ def test_shapes_that_do_not_fit() -> None:
         layer(torch.zeros(topology.zero_row, 4), topology, torch.ones(5, dtype=torch.bool))
     empty = Topology(torch.zeros((0, 3), dtype=torch.int32))
     assert layer(torch.zeros(1, 4), empty).shape == (1, 4) and layer(torch.zeros(0, 4), empty).shape == (0, 4)
-
-
-@pytest.mark.skipif(not torch.cuda.is_available(), reason="needs a CUDA device")
-def test_cuda_agrees_with_the_cpu() -> None:
-    topology, _ = cube(3, 0.6, 1)
-    rows = torch.randn(topology.zero_row + 1, 8, dtype=torch.float64)
-    rows[-1] = 0
-    layer = BlockConv3d(8, 8).double()
-    expected = layer(rows, topology)
-    found = layer.cuda()(rows.cuda(), topology.to("cuda"))
-    torch.testing.assert_close(found.cpu(), expected, atol=1e-9, rtol=1e-9)
 
 
 @pytest.mark.parametrize("kind", [torch.float64, torch.float32, torch.float16, torch.bfloat16])

@@ -9,11 +9,13 @@ import pytest
 import torch
 
 from benchmarks.timing import pinned
-from fieldfuse.nerfusion import compiled
+from fieldfuse.backends import dispatch
+from fieldfuse.backends.numba import plane_sweep as kernels
 from fieldfuse.nerfusion.cameras import Cameras
 from fieldfuse.nerfusion.extras.cross_view_consistency import CrossView, confident_points, consistency, cross_view
-from fieldfuse.nerfusion.extras.matching import LARGE, SMALL, semi_global, smoothed_softmax
-from fieldfuse.nerfusion.extras.plane_sweep import DepthDistribution, _table, carved, cost_volume, sweep_planes, to_probability
+from fieldfuse.nerfusion.extras.matching import semi_global, smoothed_softmax
+from fieldfuse.nerfusion.extras.plane_sweep import DepthDistribution, carved, cost_volume, sweep_planes, to_probability
+from tests.nerfusion.made import off
 from tests.nerfusion.test_plane_sweep import slow_paths, wall
 
 NEAR, FAR = 0.8, 6.0
@@ -66,14 +68,14 @@ def within() -> dict[str, torch.Tensor]:
 @pytest.mark.parametrize("views", [1, 2, 4])
 def test_it_gives_what_the_tensors_give(views: int, monkeypatch: pytest.MonkeyPatch) -> None:
     quick = everything(views)
-    monkeypatch.setattr(compiled, "fits", lambda *values: False)
+    off(monkeypatch)
     for name, expected in everything(views).items():
         torch.testing.assert_close(quick[name], expected, atol=1e-4, rtol=1e-4, msg=lambda text, name=name: f"{name}: {text}")
 
 
 def test_it_gives_what_the_tensors_give_within_silhouettes(monkeypatch: pytest.MonkeyPatch) -> None:
     quick = within()
-    monkeypatch.setattr(compiled, "fits", lambda *values: False)
+    off(monkeypatch)
     monkeypatch.setattr("fieldfuse.nerfusion.extras.plane_sweep.AT_ONCE", 100)
     for name, expected in within().items():
         torch.testing.assert_close(quick[name], expected, atol=1e-4, rtol=1e-4, msg=lambda text, name=name: f"{name}: {text}")
@@ -94,20 +96,8 @@ def test_threads_do_not_matter() -> None:
 def test_semi_global_matching_against_its_recurrence(shape: tuple[int, int, int]) -> None:
     cost = np.random.default_rng(0).random(shape).astype(np.float32)
     given = torch.from_numpy(cost)
-    assert compiled.fits(given)
+    assert dispatch.can_use_numba(given)
     np.testing.assert_allclose(semi_global(given).numpy(), slow_paths(cost.astype(np.float64)), atol=1e-5)
-    if shape[0] > 2:
-        np.testing.assert_allclose(compiled.semi_global(given, SMALL, LARGE).numpy(), slow_paths(cost.astype(np.float64)), atol=1e-5)
-
-
-@pytest.mark.parametrize("shape", [(32, 5, 7), (3, 2, 2), (1, 1, 1)])
-def test_tables_lie_pixel_by_pixel_in_memory(shape: tuple[int, int, int], monkeypatch: pytest.MonkeyPatch) -> None:
-    likely = torch.softmax(3 * torch.randn(shape, generator=torch.Generator().manual_seed(0)), 0)
-    quick = _table(likely, 0.02)
-    assert quick.shape == (3, *shape) and quick.permute(2, 3, 1, 0).is_contiguous()
-    assert not compiled.fits(likely.double()) and compiled.fits(likely)
-    monkeypatch.setattr(compiled, "fits", lambda *values: False)
-    torch.testing.assert_close(quick, _table(likely, 0.02), atol=1e-6, rtol=1e-5)
 
 
 def no_number(camera: Cameras) -> Cameras:
@@ -118,9 +108,9 @@ def test_cameras_out_of_this_world_are_read_as_seeing_nothing() -> None:
     descriptors, seen_by = wall(3)
     lost = Cameras.together([seen_by[0], no_number(seen_by[1]), seen_by[2]])
     honest = cost_volume([descriptors[0], descriptors[2]], seen_by[[0, 2]], NEAR, FAR)
-    comparison = compiled.Comparison(descriptors[0].flatten(1).T, honest.rays, honest.inverses, 8.0)
-    comparison.add(descriptors[1], lost.world_from_camera[1, :3, :3], lost.world_from_camera[1, :3, 3], lost.lens(1))
-    assert float(comparison.seen.max()) == 0 and float((comparison.result(0.6) - 0.6).abs().max()) < 1e-6
+    own = descriptors[0].flatten(1).T[: len(honest.rays)]
+    found = kernels.costs(descriptors[:2], lost[:2], honest.inverses, honest.rays, own, 8.0, 0.6)
+    assert float((found - 0.6).abs().max()) < 1e-6
     one = cross_view(to_probability(honest))
     spoken, seen = replace(one, camera=no_number(one.camera)).log_odds_at(places())
     assert not bool(seen.any()) and float(spoken.abs().max()) == 0

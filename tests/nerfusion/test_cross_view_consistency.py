@@ -110,9 +110,3 @@ def test_a_witness_is_believed_as_far_as_it_confirms_what_is_sure() -> None:
     half = consistency(costs, [honest])
     assert full is not None and weighed is not None and half is not None
     torch.testing.assert_close(weighed, 0.5 * reliability(honest, surface) * half)
-
-
-def test_what_tells_nothing_is_sure_of_no_place() -> None:
-    descriptors, seen_by = wall(1)
-    own_estimate = cost_volume(descriptors, seen_by, NEAR, FAR)
-    assert confident_points(own_estimate, to_probability(own_estimate)).shape == (0, 3)

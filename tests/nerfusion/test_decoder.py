@@ -7,8 +7,6 @@ from pathlib import Path
 
 import pytest
 import torch
-from hypothesis import given, settings
-from hypothesis import strategies as st
 
 from fieldfuse.nerfusion.decoder import make_decoder
 from fieldfuse.nerfusion.encoding import BEHIND, DIRECTION, spherical_harmonics
@@ -31,21 +29,6 @@ def test_harmonics_are_orthonormal() -> None:
     values = spherical_harmonics(around(20000))
     assert values.shape == (20000, DIRECTION)
     torch.testing.assert_close(4 * math.pi * values.T @ values / 20000, torch.eye(DIRECTION).double(), atol=1e-3, rtol=0)
-
-
-@given(st.tuples(*[st.floats(-1, 1)] * 3).filter(lambda v: sum(x * x for x in v) > 1e-3))
-@settings(deadline=None)
-def test_no_direction_is_preferred(vector: tuple[float, float, float]) -> None:
-    """Unsöld's theorem: the squares of a degree's 2l + 1 harmonics add up to the same everywhere."""
-    direction = torch.nn.functional.normalize(torch.tensor([vector], dtype=torch.float64))
-    squares = spherical_harmonics(direction)[0].square()
-    for degree, part in enumerate(DEGREES):
-        assert abs(float(squares[part].sum()) - (2 * degree + 1) / (4 * math.pi)) < 1e-12
-
-
-def test_the_lower_ones_are_the_same() -> None:
-    directions = around(50)
-    assert torch.equal(spherical_harmonics(directions, BEHIND), spherical_harmonics(directions)[:, :BEHIND])
 
 
 @pytest.mark.parametrize("kind", ["deferred", "per_sample"])

@@ -18,12 +18,6 @@ def test_features_are_alive_at_the_start() -> None:
         assert float(deviation.mean()) > 0.3 and float(deviation.min()) > 0.05, "features must differ from place to place"
 
 
-def test_a_dull_picture_gives_features_that_differ_too() -> None:
-    torch.manual_seed(0)
-    dull = 0.5 + 0.02 * (pictures(1, 1, (96, 128)) - 0.5)
-    assert float(ImageEncoder()(dull).detach().flatten(2).std(2).mean()) > 0.1
-
-
 def test_every_parameter_learns() -> None:
     torch.manual_seed(0)
     encoder = ImageEncoder(16)

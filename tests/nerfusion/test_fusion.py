@@ -13,11 +13,12 @@ from fieldfuse.capture.types import Views
 from fieldfuse.errors import InputError, Interrupted
 from fieldfuse.nerfusion.block_conv import BlockConv3d
 from fieldfuse.nerfusion.cameras import Cameras
-from fieldfuse.nerfusion.fusion import KEPT_PICTURES, Fused, Fusion, FusionOptions, fuse_views, fusion_lattice
-from fieldfuse.nerfusion.head import SCALE, START
+from fieldfuse.nerfusion.fusion import CACHED, Fused, Fusion, FusionOptions, fuse_views
 from fieldfuse.nerfusion.keyframes import KeyFrames
 from fieldfuse.nerfusion.lattice import Lattice, part
 from fieldfuse.nerfusion.model import NerfusionModel
+from fieldfuse.nerfusion.unproject import KeyFrame
+from fieldfuse.nerfusion.volume_net import SCALE, START
 from fieldfuse.progress import Progress
 from fieldfuse.volume.space import Space
 from tests.nerfusion.made import HEIGHT, INTRINSICS, WIDTH, poses, small_model
@@ -51,16 +52,15 @@ def opinionated(seed: int = 0) -> NerfusionModel:
 def test_one_level_is_the_plain_recurrence() -> None:
     model = opinionated()
     views, keys = captured(3)
-    lattice = fusion_lattice(SPACE, 0.05, 1)
-    assert lattice.resolution == 32
+    lattice = Lattice(SPACE, 32)
     with torch.no_grad():
         state = model.start(lattice)
         for step in fuse_views(model, views, keys, lattice, FusionOptions(1, 0.2, FAR)):
-            group = list(dict.fromkeys([step.frame, *keys.neighbours[step.frame].tolist()]))
+            group = keys.group(step.frame)
             cameras = Cameras.of([INTRINSICS] * len(group), views.world_from_camera[group])
             images = torch.stack([torch.from_numpy(views.images[i]).permute(2, 0, 1).float() / 255 for i in group])
             encoded = [model.encode(images[k : k + 1], cameras[k])[0] for k in range(len(group))]
-            state = model.fuse(state, model.local_volume(encoded, cameras, lattice, near=0.2, far=FAR))
+            state = model.fuse(state, model.local_volume(KeyFrame(encoded, cameras, 0.2, FAR), lattice))
             found = part(step.volume, state.topology)
             assert step.volume.topology.blocks == state.topology.blocks
             assert torch.equal(found.count, state.count)
@@ -120,7 +120,7 @@ def test_encoded_pictures_are_kept_only_for_a_while(monkeypatch: pytest.MonkeyPa
         return encode(images, cameras, side)
 
     monkeypatch.setattr(model, "encode", counted)
-    views, keys = captured(KEPT_PICTURES + 4)
+    views, keys = captured(CACHED + 4)
     lattice = Lattice(SPACE, 16)
     for _ in fuse_views(model, views, keys, lattice, FusionOptions(1, 0.2, FAR)):
         pass
@@ -134,7 +134,7 @@ def test_measured_depth_is_asked_only_when_it_is_wanted() -> None:
     plain, keys = captured(3)
     deep = captured(3)[0]
     deep.depths = [None, np.full((HEIGHT, WIDTH), 1.5, np.float32), np.zeros((HEIGHT, WIDTH), np.float32)]
-    lattice = fusion_lattice(SPACE, 0.05, 1)
+    lattice = Lattice(SPACE, 32)
 
     def fused(views: Views, measured: bool) -> list[torch.Tensor]:
         options = FusionOptions(1, 0.5, FAR, measured=measured)
@@ -147,13 +147,6 @@ def test_measured_depth_is_asked_only_when_it_is_wanted() -> None:
     assert all(bool(torch.isfinite(rows).all()) for rows in with_it)
 
 
-def test_looking_away_adds_nothing_and_does_not_fail() -> None:
-    views, keys = captured(3)
-    views.world_from_camera[:, 2, 3] = 40.0
-    steps = list(fuse_views(small_model().eval(), views, keys, Lattice(SPACE, 32), FusionOptions(2, 0.2, FAR)))
-    assert len(steps) == 3 and steps[-1].volume.topology.blocks == 0
-
-
 def test_what_cannot_be_is_refused() -> None:
     views, keys = captured(2)
     model = small_model().eval()
@@ -161,10 +154,6 @@ def test_what_cannot_be_is_refused() -> None:
         next(fuse_views(model, views, KeyFrames(np.zeros(0, int), np.zeros((0, 2), int)), Lattice(SPACE, 32)))
     with pytest.raises(InputError, match="levels"):
         next(fuse_views(model, views, keys, Lattice(SPACE, 24), FusionOptions(2)))
-    for size in (0.0, -1.0, float("nan"), float("inf"), 1e-6):
-        with pytest.raises(InputError, match="voxel"):
-            fusion_lattice(SPACE, size, 2)
-    assert fusion_lattice(SPACE, 0.1, 2).resolution == 16 and fusion_lattice(SPACE, 100.0, 2).resolution == 16
 
 
 def test_a_stop_is_honoured_between_key_frames() -> None:
@@ -185,7 +174,7 @@ def test_a_stop_is_honoured_between_key_frames() -> None:
 
 def test_where_a_device_works_behind_the_processor_pictures_are_encoded_ahead(monkeypatch: pytest.MonkeyPatch) -> None:
     """Those of some key frames at once, before they are asked for, each once, and with the same result."""
-    model, (views, keys), lattice = opinionated(), captured(11), fusion_lattice(SPACE, 0.2, 1)
+    model, (views, keys), lattice = opinionated(), captured(11), Lattice(SPACE, 8)
     encode, together = model.encode, list[int]()
 
     def counted(images: torch.Tensor, *rest: object) -> object:

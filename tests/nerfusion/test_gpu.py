@@ -20,28 +20,23 @@ os.environ.setdefault("TRITON_INTERPRET", "1")
 
 from fieldfuse.backends import dispatch
 from fieldfuse.backends.triton import blocks as blocks_gpu
-from fieldfuse.backends.triton import convolution, matching, observe, reading
-from fieldfuse.backends.triton import describe as describing
+from fieldfuse.backends.triton import convolution, depth_reading, local_volume, plane_sweep
 from fieldfuse.backends.triton import feature_lookup as lookup
-from fieldfuse.backends.triton import gru as compiled_rows
-from fieldfuse.backends.triton import split as split_gpu
-from fieldfuse.backends.triton import tables as tables_gpu
 from fieldfuse.backends.triton import volumes as volumes_gpu
-from fieldfuse.nerfusion import compiled, compiled_lookup
 from fieldfuse.nerfusion.block_conv import BlockConv3d, Prepared, block_conv3d
-from fieldfuse.nerfusion.cull import all_blocks
+from fieldfuse.nerfusion.cameras import all_blocks
 from fieldfuse.nerfusion.extras.cross_view_consistency import consistency, cross_view, own_estimate
 from fieldfuse.nerfusion.extras.matching import patch_descriptors, semi_global, smoothed_softmax
-from fieldfuse.nerfusion.extras.plane_sweep import _table, cost_volume, to_probability
+from fieldfuse.nerfusion.extras.plane_sweep import _table, cost_volume, sweep_planes, to_probability
 from fieldfuse.nerfusion.fusion import Fusion, FusionOptions
 from fieldfuse.nerfusion.lattice import LatentVolume, Lattice, cells, rows_of
-from fieldfuse.nerfusion.unproject import look_up, project
+from fieldfuse.nerfusion.unproject import KeyFrame, look_up, project
 from fieldfuse.render.march import MarchGrid, march
 from fieldfuse.volume.edit import corner_nodes, split
 from fieldfuse.volume.space import Space
 from fieldfuse.volume.topology import Topology
 from tests.nerfusion.made import SMALL as SIZES
-from tests.nerfusion.made import cameras, lattice, pictures, small_model
+from tests.nerfusion.made import cameras, lattice, off, pictures, small_model
 from tests.nerfusion.test_compiled import FAR, NEAR, boxed, everything
 from tests.nerfusion.test_compiled_gru import trained, volumes
 from tests.nerfusion.test_plane_sweep import wall
@@ -52,14 +47,14 @@ ROOT = Path(__file__).resolve().parents[2]
 @pytest.fixture(autouse=True)
 def large_tiles(monkeypatch: pytest.MonkeyPatch) -> None:
     """The interpreter takes as long for a tile of four as for one of a thousand."""
-    monkeypatch.setattr(matching, "TILE", (1024, 32))
-    monkeypatch.setattr(matching, "PLANES", 16)
-    monkeypatch.setattr(matching, "PIXELS", 1024)
-    monkeypatch.setattr(reading, "TILE", (1024, 32))
-    monkeypatch.setattr(describing, "BLOCK", 1024)
-    for module in (reading, lookup, observe, compiled_rows, volumes_gpu, tables_gpu):
+    monkeypatch.setattr(plane_sweep, "TILE", (1024, 32))
+    monkeypatch.setattr(plane_sweep, "PLANES", 16)
+    monkeypatch.setattr(plane_sweep, "PIXELS", 1024)
+    monkeypatch.setattr(depth_reading, "TILE", (1024, 32))
+    monkeypatch.setattr(plane_sweep, "BLOCK", 1024)
+    for module in (depth_reading, lookup, local_volume, volumes_gpu, blocks_gpu):
         monkeypatch.setattr(module, "BLOCK", 2048)
-    for module, names in ((convolution, ("TILE", "SLOPES")), (blocks_gpu, ("TILE",)), (split_gpu, ("TILE",)), (observe, ("PART",))):
+    for module, names in ((convolution, ("TILE", "SLOPES")), (blocks_gpu, ("TILE",)), (local_volume, ("PART",))):
         for name in names:
             monkeypatch.setattr(module, name, 512)
 
@@ -89,14 +84,14 @@ def _use_triton(monkeypatch: pytest.MonkeyPatch, kinds: tuple[torch.dtype, ...] 
 
 def forced(monkeypatch: pytest.MonkeyPatch) -> None:
     """Tensors on the CPU take the way of those on CUDA."""
-    monkeypatch.setattr(compiled, "fits", lambda *values: False)
+    off(monkeypatch)
     _use_triton(monkeypatch)
 
 
 @pytest.mark.parametrize("shape", [(40, 5, 6), (3, 6, 1), (64, 1, 3)])
 def test_matching(shape: tuple[int, int, int], monkeypatch: pytest.MonkeyPatch) -> None:
     cost = torch.rand(shape, generator=torch.Generator().manual_seed(0))
-    monkeypatch.setattr(compiled, "fits", lambda *values: False)
+    off(monkeypatch)
     smooth, likely = semi_global(cost), smoothed_softmax(cost)
     table = _table(likely, 0.1)
     forced(monkeypatch)
@@ -111,7 +106,7 @@ def test_a_sweep_and_its_witnesses(monkeypatch: pytest.MonkeyPatch) -> None:
     views = 3
     monkeypatch.setattr("fieldfuse.nerfusion.extras.plane_sweep.SPACING", 14)  # the interpreter is slow
     monkeypatch.setattr("fieldfuse.nerfusion.extras.plane_sweep.PLANES", (8, 16))
-    monkeypatch.setattr(compiled, "fits", lambda *values: False)
+    off(monkeypatch)
     slow = everything(views, 1000)
     forced(monkeypatch)
     for name, quick in everything(views, 1000).items():
@@ -133,7 +128,7 @@ def test_what_pictures_are_compared_by(size: tuple[int, int], last: bool, monkey
 def test_pictures_of_several_sizes_and_silhouettes(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("fieldfuse.nerfusion.extras.plane_sweep.WITHIN", 7)
     monkeypatch.setattr("fieldfuse.nerfusion.extras.plane_sweep.PLANES", (8, 16))
-    monkeypatch.setattr(compiled, "fits", lambda *values: False)
+    off(monkeypatch)
     descriptors, seen_by = wall(3)
     descriptors = [descriptors[0], descriptors[1][:, ::2].contiguous(), descriptors[2][:, :, ::3]]
 
@@ -153,7 +148,7 @@ def test_what_a_sensor_measured(within: bool, monkeypatch: pytest.MonkeyPatch) -
     monkeypatch.setattr("fieldfuse.nerfusion.extras.plane_sweep.SPACING", 8)
     monkeypatch.setattr("fieldfuse.nerfusion.extras.plane_sweep.WITHIN", 7)
     monkeypatch.setattr("fieldfuse.nerfusion.extras.plane_sweep.PLANES", (8, 16))
-    monkeypatch.setattr(compiled, "fits", lambda *values: False)
+    off(monkeypatch)
     descriptors, seen_by = wall(2)
     depth = 1.5 + torch.rand(31, 45, generator=torch.Generator().manual_seed(0))
     depth[::3], depth[1, ::2], depth[2, ::3], depth[4, 5], depth[5, 7] = 0, torch.inf, torch.nan, 0.1, 99.0
@@ -171,9 +166,9 @@ def test_what_witnesses_say_together(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("fieldfuse.nerfusion.extras.plane_sweep.SPACING", 14)
     monkeypatch.setattr("fieldfuse.nerfusion.extras.plane_sweep.PLANES", (8, 16))
     monkeypatch.setattr("fieldfuse.nerfusion.extras.cross_view_consistency.SURE", 0.4)
-    monkeypatch.setattr(compiled, "fits", lambda *values: False)
-    monkeypatch.setattr(reading, "BLOCK", 32)
-    monkeypatch.setattr(reading, "PARTS", 2)
+    off(monkeypatch)
+    monkeypatch.setattr(depth_reading, "BLOCK", 32)
+    monkeypatch.setattr(depth_reading, "PARTS", 2)
     descriptors, seen_by = wall(3)
 
     def everything() -> list[torch.Tensor]:
@@ -238,7 +233,7 @@ def test_lookup(monkeypatch: pytest.MonkeyPatch) -> None:
     points = torch.rand(300, 3, generator=generator) * 2 - 1
     projection = project(points, torch.rand(300, generator=generator) * 0.4, seen_by, 0.0, 9.0)
     step = torch.rand(300, generator=generator) * 6
-    monkeypatch.setattr(compiled_lookup, "fits", lambda *values: False)
+    off(monkeypatch)
     with torch.no_grad():
         slow = look_up(views, projection, step)
         _use_triton(monkeypatch)
@@ -283,12 +278,9 @@ def on_device(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(convolution, "convolve", convolved)
     _use_triton(monkeypatch, dispatch.FLOATS)
     _use_triton(monkeypatch, None)
-    monkeypatch.setattr("fieldfuse.nerfusion.gru.on_cpu", lambda device: False)
-    nerfusion = ("fusion", "lattice", "store", "model", "cull")
+    nerfusion = ("fusion", "lattice", "model", "gru")
     for module in (*(f"nerfusion.{name}" for name in nerfusion), "volume.topology", "volume.edit"):
         monkeypatch.setattr(f"fieldfuse.{module}.is_cpu", lambda device: False)
-    for module in ("nerfusion.compiled_lookup", "nerfusion.model"):
-        monkeypatch.setattr(f"fieldfuse.{module}.fits", lambda *values: False)
 
 
 def same(one: LatentVolume, other: LatentVolume, names: tuple[str, ...]) -> None:
@@ -312,15 +304,15 @@ def test_a_local_volume(shell: float, variance: bool, count: int, monkeypatch: p
         for parameter in model.local.parameters():
             parameter.normal_(0, 0.2, generator=torch.Generator().manual_seed(1))
         views = model.encode(pictures(count), seen_by)
-        distribution = model.sweep_planes(views, seen_by, 0.8, 4.0)
-        keys = all_blocks(space)[:3]
+        distribution = sweep_planes([view.descriptors for view in views], seen_by, 0.8, 4.0)
+        frame, keys = KeyFrame(views, seen_by, 0.1, 4.0, distribution), all_blocks(space)[:3]
         few = torch.rand(len(keys) * 512, generator=torch.Generator().manual_seed(2)) < 0.4
         for wanted in (None, few):
-            slow = model.local_volume(views, seen_by, space, Topology(keys), wanted, 0.1, 4.0, distribution)
+            slow = model.local_volume(frame, space, Topology(keys), wanted)
             with monkeypatch.context() as patch:
                 on_device(patch)
                 topology = Topology(keys, bounds=space.bounds("cpu"))
-                quick = model.local_volume(views, seen_by, space, topology, wanted, 0.1, 4.0, distribution)
+                quick = model.local_volume(frame, space, topology, wanted)
                 assert quick.near_surface.blocks == slow.near_surface.blocks > 0
                 same(quick, slow, ("rows", "count", "raw", "weight"))
 
@@ -333,12 +325,12 @@ def test_key_frames_are_fused(monkeypatch: pytest.MonkeyPatch) -> None:
         for parameter in (*model.local.parameters(), *model.fusion.parameters()):
             parameter.add_(0.05 * torch.randn(parameter.shape, generator=torch.Generator().manual_seed(parameter.numel())))
         views = model.encode(pictures(4), seen_by)
-        distribution = [model.sweep_planes([views[k] for k in group], seen_by[group], 0.8, 4.0) for group in ([0, 1], [3, 2])]
+        distribution = [sweep_planes([views[k].descriptors for k in group], seen_by[group], 0.8, 4.0) for group in ([0, 1], [3, 2])]
 
     def fused() -> Fusion:
         fusion = Fusion(model, space, FusionOptions(2, 0.1, 4.0))
-        for group, sweep_planes in zip(([0, 1], [3, 2]), distribution, strict=True):
-            fusion.add([views[k] for k in group], seen_by[group], None, sweep_planes)
+        for group, one in zip(([0, 1], [3, 2]), distribution, strict=True):
+            fusion.add([views[k] for k in group], seen_by[group], None, one)
         return fusion
 
     slow = fused()
@@ -356,7 +348,7 @@ def test_key_frames_are_fused(monkeypatch: pytest.MonkeyPatch) -> None:
 def test_a_step_of_the_gru(busy: int, monkeypatch: pytest.MonkeyPatch) -> None:
     part, local = volumes(busy, busy)
     made = trained()
-    monkeypatch.setattr("fieldfuse.nerfusion.model.fits", lambda *_: False)
+    off(monkeypatch)
     with torch.no_grad():
         expected = made.fuse_part(part, local)
         on_device(monkeypatch)

@@ -16,6 +16,7 @@ from fieldfuse.nerfusion.extras import keyframe_depth
 from fieldfuse.nerfusion.extras.keyframe_depth import LEAST_OVERLAP, MOST, KeyframeDepth, overlapping
 from fieldfuse.nerfusion.extras.plane_sweep import DepthDistribution
 from fieldfuse.nerfusion.fusion import FusionOptions, fuse_views
+from fieldfuse.nerfusion.images import ImageCache
 from fieldfuse.nerfusion.keyframes import KeyFrames
 from fieldfuse.poses.overlap import overlap
 from tests.nerfusion.made import HEIGHT, INTRINSICS, WIDTH, lattice, small_model, wall_pictures
@@ -30,6 +31,10 @@ def captured(count: int = 5) -> tuple[Views, KeyFrames]:
     views = Views([str(i) for i in range(count)], pictures, [INTRINSICS] * count, poses, np.zeros(count, bool))
     near = np.array([[max(i - 1, 0), min(i + 1, count - 1)] for i in range(count)])
     return views, KeyFrames(np.arange(count), near)
+
+
+def depths(views: Views, keys: KeyFrames, others: list[list[int]], measured: bool = False) -> KeyframeDepth:
+    return KeyframeDepth(ImageCache(views, measured=measured), keys, others, NEAR, FAR)
 
 
 def around(count: int, radius: float = 2.0) -> Array:
@@ -68,18 +73,18 @@ def test_each_sweep_is_made_once_and_again_only_when_it_was_forgotten(monkeypatc
     monkeypatch.setattr(keyframe_depth, "cost_volume", counted)
     views, keys = captured(5)
     witnesses = [[j for j in range(5) if j != i] for i in range(5)]
-    kept = KeyframeDepth(views, keys, witnesses, NEAR, FAR)
+    kept = depths(views, keys, witnesses)
     tables = [kept(at).table for at in range(5)]
     assert len(made) == 5
     assert torch.equal(kept(2).table, tables[2]) and len(made) == 6, "a second time it is compared again, and its witnesses are not"
-    monkeypatch.setattr(keyframe_depth, "KEPT", 2)
-    forgetful = KeyframeDepth(views, keys, witnesses, NEAR, FAR)
+    monkeypatch.setattr(keyframe_depth, "CACHED", 2)
+    forgetful = depths(views, keys, witnesses)
     assert all(torch.equal(forgetful(at).table, table) for at, table in enumerate(tables)) and len(made) > 11
 
 
 def test_what_it_keeps_goes_with_it() -> None:
     views, keys = captured(3)
-    kept = KeyframeDepth(views, keys, [[1], [0], [1]], NEAR, FAR)
+    kept = depths(views, keys, [[1], [0], [1]])
     kept(0)
     gone = weakref.ref(kept)
     gc.disable()
@@ -107,8 +112,8 @@ def test_witnesses_mend_a_key_frame_that_sees_no_texture() -> None:
         inverse = distribution.lowest + (likely.argmax(0) + 0.5) * distribution.step
         return float((inverse * 2.0 - 1).abs().median())
 
-    own_estimate = KeyframeDepth(views, keys, [[]] * 7, NEAR, FAR)(3)
-    held = KeyframeDepth(views, keys, [[0, 1, 5, 6]] * 7, NEAR, FAR)(3)
+    own_estimate = depths(views, keys, [[]] * 7)(3)
+    held = depths(views, keys, [[0, 1, 5, 6]] * 7)(3)
     assert wrong(held) < 0.1 < wrong(own_estimate)
 
 
@@ -119,7 +124,7 @@ def test_the_fusion_takes_them() -> None:
 
     def fused(witnesses: list[list[int]] | None) -> torch.Tensor:
         rows = torch.zeros(0)
-        for state in fuse_views(model, views, keys, lattice(), options, witnesses=witnesses):
+        for state in fuse_views(model, views, keys, lattice(), options, others=witnesses):
             rows = state.volume.rows.clone()
         return rows
 
@@ -136,7 +141,7 @@ def test_a_sensor_speaks_through_its_key_frame() -> None:
     point = torch.tensor([[0.0, 0.0, 0.5]])  # behind the wall at z = 0
 
     def open_there(measured: bool) -> float:
-        return float(KeyframeDepth(flat, keys, [[1], [], [1]], NEAR, FAR, measured)(0).look(point, torch.tensor([0.1])).visibility)
+        return float(depths(flat, keys, [[1], [], [1]], measured)(0).look(point, torch.tensor([0.1])).visibility)
 
     assert open_there(True) < 0.2 < open_there(False)
 
@@ -144,19 +149,12 @@ def test_a_sensor_speaks_through_its_key_frame() -> None:
 def test_no_depth_at_all_is_refused() -> None:
     views, keys = captured(3)
     with pytest.raises(ValueError, match="nearest or a farthest"):
-        KeyframeDepth(views, keys, [[]] * 3, 0.0, float("inf"))
+        KeyframeDepth(ImageCache(views), keys, [[]] * 3, 0.0, float("inf"))
 
 
 def test_witnesses_and_silhouettes_together_are_refused() -> None:
     views, keys = captured(3)
-    steps = fuse_views(
-        small_model().eval(),
-        views,
-        keys,
-        lattice(),
-        FusionOptions(1, NEAR, FAR),
-        empty=lambda points: points[:, 2] < 0,
-        witnesses=[[1], [0], [1]],
-    )
+    options = FusionOptions(1, NEAR, FAR, empty=lambda points: points[:, 2] < 0)
+    steps = fuse_views(small_model().eval(), views, keys, lattice(), options, others=[[1], [0], [1]])
     with pytest.raises(ValueError, match="one of the two"):
         next(steps)

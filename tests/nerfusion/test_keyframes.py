@@ -10,6 +10,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from fieldfuse.camera import Similarity
+from fieldfuse.config import KeyframesSettings
 from fieldfuse.errors import InputError
 from fieldfuse.nerfusion.keyframes import UNIFORM, KeyFrames, select_keyframes
 from fieldfuse.poses.overlap import convergence, guessed_depth, overlap, parallax
@@ -17,7 +18,8 @@ from tests.poses.textured import CAMERA, arc, look_at
 
 
 def choose(poses, depth=3.0, **options):
-    return select_keyframes(poses, [CAMERA] * len(poses), depth, **options)
+    wanted = KeyframesSettings(**{name: options.pop(name) for name in ("method", "every", "most") if name in options})
+    return select_keyframes(poses, [CAMERA] * len(poses), depth, wanted, **options)
 
 
 @settings(max_examples=40, deadline=None)

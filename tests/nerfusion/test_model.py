@@ -9,9 +9,10 @@ import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
+from fieldfuse.nerfusion.extras.two_lattices import solid_cells
 from fieldfuse.nerfusion.lattice import LatentVolume, LocalVolume
 from fieldfuse.nerfusion.model import ModelConfig, NerfusionModel
-from fieldfuse.nerfusion.prune import solid_cells
+from fieldfuse.nerfusion.unproject import KeyFrame
 from fieldfuse.volume.topology import VOXELS, Topology
 from tests.nerfusion.made import SMALL, cameras, lattice, pictures, small_model
 
@@ -21,7 +22,7 @@ def local(model: NerfusionModel, views: list[int], seed: int = 0, shift: float =
     pose = seen_by.world_from_camera.clone()
     pose[:, 0, 3] += shift
     seen_by = replace(seen_by, world_from_camera=pose)[views]
-    return model.local_volume(model.encode(pictures(4, seed)[views], seen_by), seen_by, lattice(32, shell), near=0.3, far=3.5)
+    return model.local_volume(KeyFrame(model.encode(pictures(4, seed)[views], seen_by), seen_by, 0.3, 3.5), lattice(32, shell))
 
 
 def by_place(volume: LatentVolume) -> dict[tuple[int, int, int], torch.Tensor]:
@@ -57,7 +58,7 @@ def test_nothing_in_sight_gives_an_empty_volume() -> None:
     pose = seen_by.world_from_camera.clone()
     pose[:, 2, 3] = 50.0
     seen_by = replace(seen_by, world_from_camera=pose)
-    volume = model.local_volume(model.encode(pictures(2), seen_by), seen_by, lattice(), far=3.0)
+    volume = model.local_volume(KeyFrame(model.encode(pictures(2), seen_by), seen_by, far=3.0), lattice())
     state = model.fuse(model.start(lattice()), volume)
     assert volume.topology.blocks == 0 and state.topology.blocks == 0
     assert [len(rows) for rows in model.head(state)] == [1, 1]
@@ -69,7 +70,7 @@ def test_only_asked_voxels_are_filled() -> None:
     wanted = torch.rand(len(whole.count), generator=torch.Generator().manual_seed(0)) < 0.3
     seen_by = cameras(4)[[0, 1]]
     views = model.encode(pictures(4)[[0, 1]], seen_by)
-    part = model.local_volume(views, seen_by, lattice(), whole.topology, wanted, near=0.3, far=3.5)
+    part = model.local_volume(KeyFrame(views, seen_by, 0.3, 3.5), lattice(), whole.topology, wanted)
     place = (whole.topology.find(part.topology.keys)[:, None] * VOXELS + torch.arange(VOXELS)).view(-1)
     asked = whole.count * wanted
     assert torch.equal(part.count, asked[place]) and float(part.count.sum()) == float(asked.sum())
@@ -110,7 +111,8 @@ def test_the_same_frame_a_thousand_times_does_not_drift(gain: float, times: int,
     seen_by = replace(seen_by, world_from_camera=pose)
     small = replace(lattice(16), resolution=8)
     with torch.no_grad():
-        one = model.local_volume(model.encode(pictures(1), seen_by), seen_by, small, Topology(torch.tensor([[0, 0, 0]])), near=0.1)
+        frame = KeyFrame(model.encode(pictures(1), seen_by), seen_by, 0.1)
+        one = model.local_volume(frame, small, Topology(torch.tensor([[0, 0, 0]])))
         assert int(one.known.sum()) > 20
         state, moves, early = model.start(small), [], None
         for step in range(times):

@@ -12,10 +12,9 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from fieldfuse.camera import project as project_one
-from fieldfuse.nerfusion.cameras import Cameras
-from fieldfuse.nerfusion.cull import all_blocks, block_balls, visible_blocks
+from fieldfuse.nerfusion.cameras import Cameras, all_blocks, frustum
 from fieldfuse.nerfusion.lattice import Lattice
-from fieldfuse.nerfusion.unproject import look_up, project
+from fieldfuse.nerfusion.unproject import KeyFrame, look_up, project
 from fieldfuse.volume.space import Space
 from fieldfuse.volume.topology import Topology
 from tests.nerfusion.made import HEIGHT, INTRINSICS, WIDTH, cameras, lattice, pictures, small_model
@@ -62,10 +61,10 @@ def test_directions_point_at_what_a_pixel_shows() -> None:
 @given(st.integers(0, 10**6), st.sampled_from([0.0, 1.0]), st.sampled_from([2.0, math.inf]))
 def test_culling_never_loses_a_voxel(seed: int, shell: float, far: float) -> None:
     generator = np.random.default_rng(seed)
-    seen_by = Cameras.of([INTRINSICS] * 2, np.stack([random_pose(generator) for _ in range(2)]))
+    seen_by = Cameras.of([INTRINSICS], random_pose(generator)[None])
     place = replace(lattice(32, shell), space=Space((0.1, -0.2, 0.3), 0.9, shell))
     topology = Topology(all_blocks(place))
-    kept = visible_blocks(*block_balls(place, topology.keys), seen_by, 0.2, far)
+    kept = frustum(place, seen_by, 0.2, far).slots_of(topology) >= 0
     points, size = place.working(place.contracted(topology.keys, torch.arange(topology.zero_row)))
     seen = project(points, size, seen_by, 0.2, far).visible.any(0).view(-1, 512).any(1)
     assert not bool((seen & ~kept).any()), "a block with a visible corner was culled"
@@ -91,12 +90,12 @@ def test_nothing_depends_on_the_unit_of_length() -> None:
     model = small_model().eval()
     seen_by = cameras()
     views = model.encode(pictures(), seen_by)
-    small = model.local_volume(views, seen_by, lattice(), near=0.5, far=2.4)
+    small = model.local_volume(KeyFrame(views, seen_by, 0.5, 2.4), lattice())
     pose = seen_by.world_from_camera.clone()
     pose[:, :3, 3] *= 16
     large_by = replace(seen_by, world_from_camera=pose)
     large_lattice = Lattice(Space((0.0, 0.0, 0.0), 0.8 * 16, 0.0), 32)
-    large = model.local_volume(model.encode(pictures(), large_by), large_by, large_lattice, near=8.0, far=2.4 * 16)
+    large = model.local_volume(KeyFrame(model.encode(pictures(), large_by), large_by, 8.0, 2.4 * 16), large_lattice)
     assert torch.equal(small.count, large.count) and float(small.count.max()) == 3
     torch.testing.assert_close(small.rows, large.rows, atol=1e-4, rtol=1e-3)
 

@@ -12,10 +12,11 @@ import pytest
 import torch
 
 from fieldfuse.camera import pixel_grid, rays
-from fieldfuse.nerfusion.cameras import Cameras
-from fieldfuse.nerfusion.cull import all_blocks
+from fieldfuse.nerfusion.cameras import Cameras, all_blocks
+from fieldfuse.nerfusion.extras.plane_sweep import sweep_planes
 from fieldfuse.nerfusion.lattice import LatentVolume, Lattice
 from fieldfuse.nerfusion.model import NerfusionModel
+from fieldfuse.nerfusion.unproject import KeyFrame
 from fieldfuse.render.field import Field
 from fieldfuse.render.fused import make_field, without_empty_blocks
 from fieldfuse.render.rays import render_rays, render_with_gradients
@@ -108,9 +109,9 @@ def learnt(misled: float = 0.0) -> tuple[list[float], list[float], float]:
     for _ in range(60):
         pick = torch.randint(len(origins), (256,), generator=generator)
         views = model.encode(images, seen_by)
-        distribution = model.sweep_planes(views, seen_by, 1.0, 2.8)
+        distribution = sweep_planes([view.descriptors for view in views], seen_by, 1.0, 2.8)
         distribution = replace(distribution, lowest=distribution.lowest + misled)
-        local = model.local_volume(views, seen_by, where, near=1.0, far=2.8, distribution=distribution)
+        local = model.local_volume(KeyFrame(views, seen_by, 1.0, 2.8, distribution), where)
         field = make_field(model, local, torch.full((3,), 0.5))
         jitter, behind = torch.rand(256, generator=generator), torch.rand((256, 3), generator=generator)
         seen = render_with_gradients(field, origins[pick], directions[pick], jitter, behind)

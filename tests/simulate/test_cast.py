@@ -8,8 +8,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from fieldfuse.camera import Array
-from fieldfuse.simulate.cast import FAR, cast
-from fieldfuse.simulate.solids import BALL, BOX, CYLINDER, ROOM, Solid, Solids, rod, upright
+from fieldfuse.simulate.solids import BALL, BOX, CYLINDER, FAR, ROOM, Solid, Solids, rod, upright
 
 
 def interval(solid: Solid, origin: Array, direction: Array) -> tuple[float, float]:
@@ -60,7 +59,7 @@ def test_agrees_with_the_reference(seed: int, count: int, room: bool, one_origin
     origins = rng.uniform(-2.2, 2.2, (1 if one_origin else number, 3))
     directions = rng.normal(size=(number, 3)) * [0.5, 0.5, 0.5] + (rng.random() < 0.5) * np.array([1.0, 0.3, 0.1])
     directions /= np.linalg.norm(directions, axis=1, keepdims=True)
-    distance, solid = cast(solids, torch.tensor(origins, dtype=torch.float32), torch.tensor(directions, dtype=torch.float32))
+    distance, solid = solids.cast(torch.tensor(origins, dtype=torch.float32), torch.tensor(directions, dtype=torch.float32))
     assert distance.shape == solid.shape == (number,)
     check = rng.permutation(number)[:60]
     expected = [reference(solids.items, np.broadcast_to(origins, (number, 3))[i], directions[i]) for i in check]
@@ -74,9 +73,9 @@ def test_many_rays_on_threads_are_the_same() -> None:
     directions = torch.nn.functional.normalize(torch.tensor(rng.normal(size=(9000, 3)), dtype=torch.float32), dim=1)
     before = torch.get_num_threads()
     for origins in (torch.tensor([[0.1, 0.2, -2.0]]), torch.tensor(rng.uniform(-1, 1, (9000, 3)), dtype=torch.float32)):
-        single = [cast(solids, origins[i : i + 1] if len(origins) > 1 else origins, directions[i : i + 1]) for i in range(0, 9000, 900)]
+        single = [solids.cast(origins[i : i + 1] if len(origins) > 1 else origins, directions[i : i + 1]) for i in range(0, 9000, 900)]
         torch.set_num_threads(2)
-        distance, solid = cast(solids, origins, directions)
+        distance, solid = solids.cast(origins, directions)
         torch.set_num_threads(before)
         assert torch.equal(distance[::900], torch.cat([one for one, _ in single])) and (distance < FAR).all()
         assert torch.equal(solid[::900], torch.cat([one for _, one in single]))
@@ -88,7 +87,7 @@ def test_surfaces_know_face_place_and_normal() -> None:
     solids = random_solids(rng, 15, True)
     origin = torch.tensor([[0.0, -2.3, 0.1]])
     directions = torch.nn.functional.normalize(torch.tensor(rng.normal((0, 2, 0), size=(3000, 3)), dtype=torch.float32), dim=1)
-    distance, solid = cast(solids, origin, directions)
+    distance, solid = solids.cast(origin, directions)
     hit = solid >= 0
     points = origin + distance[hit, None] * directions[hit]
     face, place, normal = solids.surface(solid[hit], points)

@@ -10,11 +10,16 @@ import numpy as np
 import pytest
 
 from fieldfuse.camera import Array, Intrinsics, project, unproject
+from fieldfuse.capture.select import select_frames
+from fieldfuse.capture.video import read_video
+from fieldfuse.config import CaptureSettings, PosesSettings
 from fieldfuse.errors import Interrupted, OutputError
+from fieldfuse.poses.sfm import find_poses
 from fieldfuse.progress import Progress
 from fieldfuse.simulate import demo
 from fieldfuse.simulate.demo import BakedScene, Filmed, Light, demo_scene, hand_held, write_demo_video
 from fieldfuse.simulate.solids import BALL, BOX, upright
+from tests.poses.textured import aligned_error
 
 CAMERA = Intrinsics(80, 60, 70.0, 70.0, 40.0, 30.0)
 FRONT = np.array([[1, 0, 0, 0], [0, 0, 1, -3], [0, -1, 0, 0.5], [0, 0, 0, 1]], dtype=float)  # at y = −3, looking along y; z is up
@@ -157,3 +162,21 @@ def test_gloss_moves_with_the_view() -> None:
 
     assert abs(seen(0.0, 0.0) - seen(0.0, 1.0)) < 4
     assert seen(0.4, 0.0) - seen(0.4, 1.0) > 15
+
+
+@pytest.mark.slow
+def test_every_chosen_frame_is_registered_where_it_was_filmed(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(demo, "TEXELS", 150)  # as fine as pictures of this size show them
+    monkeypatch.setattr(demo, "BOX_TEXELS", 350)
+    film = demo.write_demo_video(tmp_path / "demo.mp4", frames=13, size=(384, 288))
+    chosen = select_frames(read_video(tmp_path / "demo.mp4"), tmp_path, CaptureSettings())
+    found = find_poses(chosen, tmp_path, PosesSettings(max_features=1024), seed=0, threads=1)
+    assert len(chosen.frames) >= 11
+    assert found.registered == found.total == len(chosen.frames)
+    truth = np.stack([film.world_from_camera[int(name.rpartition("_")[2])] for name in found.names])  # frame_000012
+    centres = found.world_from_camera[:, :3, 3]
+    assert aligned_error(centres, truth[:, :3, 3]) < 0.007
+    turns = np.einsum("nij,nkj->nik", truth[:, :3, :3], found.world_from_camera[:, :3, :3])  # from the one frame to the other: all the same
+    apart = np.einsum("ij,nij->n", turns[len(turns) // 2], turns)
+    assert np.rad2deg(np.arccos(np.clip((apart - 1) / 2, -1, 1))).max() < 0.5
+    assert np.mean([camera.fx for camera in found.intrinsics]) == pytest.approx(film.intrinsics.fx, rel=0.02)

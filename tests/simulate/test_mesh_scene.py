@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import time
 from pathlib import Path
 
 import numpy as np
@@ -16,12 +15,9 @@ from fieldfuse.errors import InputError
 from fieldfuse.export.mesh import write_mesh
 from fieldfuse.simulate.eye import eye_of, take
 from fieldfuse.simulate.mesh_scene import MeshScene, load_mesh_scene
-from fieldfuse.simulate.paths import PathSettings, plan
 from fieldfuse.simulate.settings import scene_file
 from fieldfuse.simulate.simulate import simulate
 from fieldfuse.tsdf.mesh import Mesh
-from tests.conftest import shared_data
-from tests.simulate.test_procedural import plain_operations
 
 trimesh = pytest.importorskip("trimesh")
 pytest.importorskip("open3d")
@@ -149,25 +145,3 @@ def test_what_cannot_be_read_is_told(tmp_path: Path) -> None:
             load_mesh_scene(tmp_path / name)
     with pytest.raises(InputError, match="no mesh that can be read"):
         load_mesh_scene(tmp_path / "mesh.stl")
-
-
-@pytest.mark.slow
-def test_the_furnished_house() -> None:
-    """At 320×240 at most twice as long as a hundred rounds of arithmetic on its rays (0.6 to 0.9 where it was measured): more than two
-    pictures a second of one slow thread. A slow or busy machine does not count against it."""
-    scene = load_mesh_scene(shared_data("scenes_glb/aws_small_house.glb"))
-    scene.free, scene.focus = np.array([[-8.0, -4, 1.0], [-4, -1, 1.7]]), np.array([-6.0, -4.5, 1.0])
-    asked = PathSettings("walk", frames=4, fps=1.0, speed=0.3)
-    poses = plan(scene, asked, np.random.default_rng(0)).poses(asked.times())
-    camera = Intrinsics(320, 240, 230.0, 230.0, 160.0, 120.0)
-    take(scene, eye_of(camera, 2, scene.device), poses[:1])
-    pictures, spent, plain = [], [], []
-    for pose in poses:
-        began = time.process_time()
-        pictures.append(take(scene, eye_of(camera, 2, scene.device), pose[None]))
-        between = time.process_time()
-        plain_operations(320 * 240)
-        spent.append(between - began)
-        plain.append(time.process_time() - between)
-    assert all((taken.depth > 0).float().mean() > 0.6 for taken in pictures)
-    assert np.median(spent) < 2 * np.median(plain)

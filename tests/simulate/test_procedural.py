@@ -10,11 +10,11 @@ import torch
 
 from fieldfuse.camera import Array, Intrinsics, project, unproject
 from fieldfuse.errors import InputError
-from fieldfuse.simulate.cast import FAR
 from fieldfuse.simulate.eye import Rays
 from fieldfuse.simulate.materials import TextureBank, texture_bank
 from fieldfuse.simulate.procedural import KINDS, random_scene
 from fieldfuse.simulate.scene import Lamp, Scene
+from fieldfuse.simulate.solids import FAR
 
 CAMERA = Intrinsics(96, 72, 80.0, 80.0, 48.0, 36.0)
 

@@ -140,6 +140,8 @@ def bombs(place: Path) -> dict[str, Callable[[], Any]]:
     (place / "side.png").write_bytes(png(2**31 - 1, 1, 8, 0, b""))
     (place / "sparse.json").open("wb").truncate(2**36)
     (place / "deep.json").write_text("[" * 10_000_000)
+    LAYOUTS["tum"][1](place / "lists")
+    (place / "lists" / "rgb.txt").open("ab").truncate(2**36)
     for name, count in (("many.sens", 2**60), ("empty.sens", 50_000)):
         (place / name).write_bytes(sens_of([], count=count)[:-136])  # without what stands behind the frames
         (place / name).open("ab").truncate(2**36)
@@ -168,6 +170,7 @@ def bombs(place: Path) -> dict[str, Callable[[], Any]]:
         "a picture two thousand million pixels wide": lambda: load_image(Frame("a", place / "side.png")),
         "a folder of three pictures of 169 megapixels in nothing": lambda: check_capture(open_capture(folder)),
         "64 GB of JSON in a sparse file": lambda: read_json(place / "sparse.json"),
+        "64 GB of zeros in a list of images": lambda: open_capture(place / "lists"),
         "ten million brackets": lambda: read_json(place / "deep.json"),
         "YAML whose aliases multiply to 9¹¹": lambda: load_settings(file=text(place / "laugh.yaml", lines)),
         "YAML nested 100,000 deep": lambda: load_settings(file=text(place / "deep.yaml", "{a: " * 100_000)),

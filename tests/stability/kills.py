@@ -1,26 +1,21 @@
-"""kill -9 at random moments of a small real run, again and again: `python -m tests.stability.kills --kills 50`.
+"""kill -9 at random moments of a small real run, again and again: `python -m tests.stability kills`.
 
 Half of the moments are drawn in time, half among the changes that the run makes to files, where a kill can do the most harm. After each
 kill no file may be damaged; a run that is let go on must end with the same files as one that was never killed. The last third of the kills
-meets runs that start from the networks. With `--state FILE` a survey that was ended (by `--seconds`, say) is taken up where it was left, if
-the code is the same.
+meets runs that start from the networks.
 """
 
 from __future__ import annotations
 
-import argparse
 import random
 import signal
 import subprocess
-import sys
 import tempfile
 import time
-from dataclasses import asdict, dataclass, field
+from dataclasses import dataclass, field
 from pathlib import Path
 
-from fieldfuse.files import fingerprint, read_json, write_json
 from tests.pipelines.made import environment
-from tests.stability.page import replace_part
 from tests.stability.runs import NETWORK, ROOT, command, corrupt, differences, launch, leftovers, make_source
 
 EACH = 5  # kills before a run is left alone
@@ -44,44 +39,19 @@ class Survey:
         return [f"{self.kills} kills{started}, in {self.runs} runs: {survived}; {self.seconds:.0f} s."]
 
 
-def kill_runs(
-    folder: Path,
-    kills: int,
-    seed: int,
-    each: int = EACH,
-    seconds: float = 1e9,
-    network_share: float = NETWORK_SHARE,
-    state: Path | None = None,
-) -> Survey:
-    """Kill until `kills` are counted or the time is over; run n draws from `seed` and n alone.
-
-    Args:
-        network_share: so much of the kills, the last ones, meets runs that start from the networks.
-        state: kept after each run, and gone on from.
-    """
-    survey, code = Survey(), fingerprint([seed, each, network_share, kills, *_sources()])
-    if state is not None and state.is_file() and read_json(state).get("code") == code:
-        survey = Survey(**read_json(state)["survey"])
-    source, began, before = make_source(folder / "room"), time.monotonic(), survey.seconds
+def kill_runs(folder: Path, kills: int, seed: int, each: int = EACH, network_share: float = NETWORK_SHARE) -> Survey:
+    """Kill until `kills` are counted; run n draws from `seed` and n alone. The last `network_share` of them meet runs that start from the
+    networks."""
+    survey, source, began = Survey(), make_source(folder / "room"), time.monotonic()
     whole: dict[bool, tuple[Path, float]] = {}
     plain = kills - round(kills * network_share)
-    while survey.kills < kills and time.monotonic() - began < seconds:
-        number = survey.runs
-        networks = survey.kills >= plain
+    while survey.kills < kills:
+        number, networks = survey.runs, survey.kills >= plain
         if networks not in whole:
             whole[networks] = _undisturbed(source, folder / f"whole{networks:d}", networks)
-        _one_run(
-            survey,
-            random.Random(f"{seed} {number}"),
-            source,
-            folder / f"run{number}",
-            *whole[networks],
-            networks,
-            min(each, (kills if networks else plain) - survey.kills),
-        )
-        survey.seconds = before + time.monotonic() - began
-        if state is not None:
-            write_json(state, {"code": code, "survey": asdict(survey)})
+        draw, left = random.Random(f"{seed} {number}"), (kills if networks else plain) - survey.kills
+        _one_run(survey, draw, source, folder / f"run{number}", *whole[networks], networks, min(each, left))
+    survey.seconds = time.monotonic() - began
     return survey
 
 
@@ -121,11 +91,6 @@ def options(networks: bool) -> tuple[str, ...]:
     return NETWORK if networks else ()
 
 
-def _sources() -> list[str]:
-    """What the runs are made of."""
-    return [fingerprint(path) for part in ("toolkit", "pipelines", "tests/stability") for path in sorted((ROOT / part).rglob("*.py"))]
-
-
 def count_changes(folder: Path) -> int:
     """About how many changes to files a run makes: each file is opened, and renamed."""
     return 2 * sum(path.is_file() for path in folder.rglob("*")) + 10
@@ -142,23 +107,8 @@ def killed_after(seconds: float, source: Path, out: Path, *more: str) -> int:
         return process.wait()
 
 
-def main() -> int:
-    parser = argparse.ArgumentParser(prog="kills")
-    parser.add_argument("--kills", type=int, default=50)
-    parser.add_argument("--seed", type=int, default=1)
-    parser.add_argument("--seconds", type=float, default=1e9)
-    parser.add_argument("--state", type=Path)
-    parser.add_argument("--page", type=Path)
-    chosen = parser.parse_args()
+def survey(kills: int, seed: int) -> tuple[list[str], list[str]]:
+    """What was wrong, and lines for the page."""
     with tempfile.TemporaryDirectory(prefix="fieldfuse-kills-") as folder:
-        survey = kill_runs(Path(folder), chosen.kills, chosen.seed, seconds=chosen.seconds, state=chosen.state)
-    for text in survey.wrong:
-        sys.stdout.write(text + "\n")
-    sys.stdout.write("\n".join(survey.lines()) + f"\n{survey.late} moments came too late\n")
-    if chosen.page is not None:
-        replace_part(chosen.page, "kills", survey.lines())
-    return 1 if survey.wrong else 0
-
-
-if __name__ == "__main__":
-    sys.exit(main())
+        found = kill_runs(Path(folder), kills, seed)
+    return found.wrong, found.lines()

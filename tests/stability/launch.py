@@ -1,8 +1,7 @@
 """`fieldfuse …` with something going wrong at a chosen moment: `python -m tests.stability.launch JSON run SOURCE --out DIR …`.
 
 JSON: `event` n and `signal` s: send s to this process at its n-th change of a file (open for writing, rename, remove, make a folder).
-`stage` and `memory`: from when that stage begins the process may take so many bytes more. `ticks`: the clock of the fit advances by so
-many seconds a look, so that a fit of a given budget makes the same steps on every machine.
+`ticks`: the clock of the fit advances by so many seconds a look, so that a fit of a given budget makes the same steps on every machine.
 """
 
 from __future__ import annotations
@@ -10,12 +9,9 @@ from __future__ import annotations
 import itertools
 import json
 import os
-import resource
 import signal
 import sys
 import time
-from collections.abc import Callable
-from pathlib import Path
 from typing import Any
 
 CHANGES = ("os.rename", "os.remove", "os.mkdir", "os.rmdir")
@@ -37,27 +33,6 @@ def strike_at(count: int, number: int) -> None:
     sys.addaudithook(hear)
 
 
-def at_stage(stage: str, strike: Callable[[], None]) -> None:
-    """Do something as soon as a stage begins."""
-    from fieldfuse.pipelines.console import ConsoleProgress
-
-    plain = ConsoleProgress.begin
-
-    def begin(self: ConsoleProgress, name: str) -> None:
-        plain(self, name)
-        if name == stage:
-            strike()
-
-    ConsoleProgress.begin = begin  # type: ignore[method-assign]
-
-
-def little_memory(more: int) -> None:
-    """From now on this process may take `more` bytes beyond what it has."""
-    status = Path("/proc/self/status").read_text(encoding="ascii")
-    now = int(next(line for line in status.splitlines() if line.startswith("VmSize:")).split()[1]) * 1024
-    resource.setrlimit(resource.RLIMIT_AS, (now + more, resource.RLIM_INFINITY))
-
-
 def steady_clock(tick: float) -> None:
     """`perf_counter` advances by `tick` at each look: what is bounded by seconds is then bounded by steps."""
     looks = itertools.count()
@@ -69,8 +44,6 @@ def main() -> None:
     sys.argv = ["fieldfuse", *sys.argv[2:]]
     if "ticks" in plan:
         steady_clock(plan["ticks"])
-    if "stage" in plan:
-        at_stage(plan["stage"], lambda: little_memory(plan["memory"]))
     if "event" in plan:
         strike_at(plan["event"], getattr(signal, plan["signal"]))
     from fieldfuse.pipelines.cli import main as command

@@ -1,6 +1,6 @@
 """`docs/stability.md`: the parts between `<!-- NAME -->` and `<!-- /NAME -->` are written by programs, the rest by people.
 
-`pytest tests/stability/hard --page docs/stability.md` runs every hard case and replaces the parts `kernels` and `cases`.
+`pytest tests/stability/hard --page docs/stability.md` runs every hard case and replaces the part `cases`.
 """
 
 from __future__ import annotations
@@ -9,7 +9,7 @@ import math
 import re
 from pathlib import Path
 
-from tests.stability.hard.within import Measure, Within
+from tests.stability.hard.within import Within
 
 
 def replace_part(page: Path, name: str, lines: list[str]) -> None:
@@ -49,35 +49,6 @@ def case_lines(cases: list[Within]) -> list[str]:
         quantity = worst.quantity.replace("|", "·")
         out.append(f"| {case.title} | {len(case.measures)} | {quantity} | {number(worst.error)} | {number(worst.bound)} |")
     return out
-
-
-def kernel_lines(cases: list[Within]) -> list[str]:
-    """A table: each kernel's worst errors that are relative (by the reference's size, or by its largest entry), values and gradients."""
-    groups: dict[str, list[Measure]] = {}
-    for case in cases:
-        groups.setdefault(case.title.split(": ")[0], []).extend(case.measures)
-    out = ["| kernel | worst relative error, float32 | of a gradient | in lower precision |", "| --- | --- | --- | --- |"]
-    for group, measures in groups.items():
-        known = [measure for measure in measures if _relative(measure)]
-        low = [measure for measure in known if re.search(r"bfloat16|float16|autocast", measure.quantity)]
-        slopes = [measure for measure in known if measure not in low and "gradient" in measure.quantity]
-        values = [measure for measure in known if measure not in low and measure not in slopes]
-        if known:
-            out.append(f"| {group} | {_worst(values)} | {_worst(slopes)} | {_worst(low)} |")
-    return out
-
-
-def _relative(measure: Measure) -> bool:
-    """Errors by a size, and those of values of about 1; not counts, lengths in steps or decibels, nor bounds of zero or above a tenth."""
-    counted = (
-        r"in steps|length along|in voxels|in pixels|dB|not finite|is not|lost|wrong|share|metres|PSNR|float64 can|rounding|orthonormal"
-        r"|that meet"
-    )
-    return 0 < measure.bound < 0.1 and not re.search(counted, measure.quantity)
-
-
-def _worst(measures: list[Measure]) -> str:
-    return number(max(measure.error for measure in measures)) if measures else "–"
 
 
 def _share(error: float, bound: float) -> float:

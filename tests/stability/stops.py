@@ -1,4 +1,4 @@
-"""SIGINT and SIGTERM at each stage of small real runs: `python -m tests.stability.stops`.
+"""SIGINT and SIGTERM at each stage of small real runs: `python -m tests.stability stops`.
 
 One folder is stopped at one stage after the other, once (the stage is brought to an end) or twice (at once). Each time the command must end
 in a sentence with whole files; then the same command goes on, and must end with the files of a run that nobody stopped.
@@ -6,7 +6,6 @@ in a sentence with whole files; then the same command goes on, and must end with
 
 from __future__ import annotations
 
-import argparse
 import contextlib
 import io
 import itertools
@@ -25,7 +24,6 @@ import cv2
 
 from fieldfuse.files import read_json
 from tests.pipelines.made import CAMERA, Answer, circle, make_room, shoot
-from tests.stability.page import replace_part
 from tests.stability.runs import OPTIONS, STAGES, TICK, corrupt, differences, leftovers, make_source
 
 REPORT = "report"  # not a stage with a record: the last thing that a run does
@@ -160,34 +158,16 @@ def stop_everywhere(folder: Path, kind: Kind, times: int, first: int = 0, only: 
     return wrong + differences(whole, out) + leftovers(out) + corrupt(out)
 
 
-def told(names: list[str], count: int, wrong: list[str], seconds: float) -> list[str]:
-    """What came of it, for the page."""
-    ended = "all survived" if not wrong else f"{len(wrong)} problems"
-    stages = [f"- {name}: {', '.join((*KINDS[name].stages, REPORT))}" for name in names]
-    return [f"{count} stops: {ended}; {seconds:.0f} s. The stages of each kind of run:", "", *stages]
-
-
-def main() -> int:
-    parser = argparse.ArgumentParser(prog="stops")
-    parser.add_argument("--only", action="append", default=[], choices=list(KINDS))
-    parser.add_argument("--page", type=Path)
-    chosen = parser.parse_args()
+def survey(kinds: list[str]) -> tuple[list[str], list[str]]:
+    """What was wrong, and lines for the page."""
     count, wrong, began = 0, [], time.monotonic()
-    for name in chosen.only or KINDS:
+    for name in kinds:
         for times, first in itertools.product((1, 2), (0, 1)):
             with tempfile.TemporaryDirectory(prefix="fieldfuse-stops-") as folder:
                 found = stop_everywhere(Path(folder), KINDS[name], times, first)
             count += len(KINDS[name].stages) + 1
             wrong += [f"{name}: {text}" for text in found]
             sys.stderr.write(f"{time.monotonic() - began:6.0f} s  {name}, {times}×: {len(found)} problems\n")
-    for text in wrong:
-        sys.stdout.write(text + "\n")
-    lines = told(chosen.only or list(KINDS), count, wrong, time.monotonic() - began)
-    sys.stdout.write("\n".join(lines) + "\n")
-    if chosen.page is not None:
-        replace_part(chosen.page, "stops", lines)
-    return 1 if wrong else 0
-
-
-if __name__ == "__main__":
-    sys.exit(main())
+    ended = "all survived" if not wrong else f"{len(wrong)} problems"
+    stages = [f"- {name}: {', '.join((*KINDS[name].stages, REPORT))}" for name in kinds]
+    return wrong, [f"{count} stops: {ended}; {time.monotonic() - began:.0f} s. The stages of each kind of run:", "", *stages]

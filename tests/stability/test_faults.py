@@ -15,15 +15,16 @@ import pytest
 
 from fieldfuse.config import Settings
 from fieldfuse.pipelines.folder import RunFolder
-from tests.pipelines.made import Answer, environment
+from tests.pipelines.made import environment
 from tests.stability.kills import kill_runs
-from tests.stability.runs import OPTIONS, PATIENCE, ROOT, corrupt, differences, launch, leftovers, make_source
+from tests.stability.runs import OPTIONS, PATIENCE, ROOT, corrupt, differences, leftovers, make_source
 from tests.stability.stops import KINDS, fieldfuse, stop_everywhere
-from tests.stability.writers_more import ELSEWHERE
+from tests.stability.writers import ELSEWHERE
 
 LONG = pytest.mark.timeout(900)  # what takes half a minute alone takes minutes on a busy machine
 
 
+@pytest.mark.slow
 @LONG
 def test_killed_twice_at_random_the_run_goes_on_to_the_same_files(tmp_path: Path) -> None:
     survey = kill_runs(tmp_path, kills=2, seed=int(os.environ.get("FIELDFUSE_SEED", "7")), each=3, network_share=0)
@@ -58,6 +59,7 @@ def test_the_comparison_of_folders_notices_changes(tmp_path: Path) -> None:
 # ------------------------------------------------------------------------------------------------ signals
 
 
+@pytest.mark.slow
 @LONG
 @pytest.mark.parametrize(
     ("kind", "times", "only"),
@@ -77,6 +79,7 @@ def test_a_stop_that_is_not_heard_is_noticed(tmp_path: Path, monkeypatch: pytest
 # ------------------------------------------------------------------------------------------------ disks
 
 
+@pytest.mark.slow
 @LONG
 def test_every_writer_says_that_the_disk_is_full_or_the_folder_closed(tmp_path: Path) -> None:
     done = subprocess.run(
@@ -101,7 +104,7 @@ def test_no_module_with_a_writer_is_left_out() -> None:
     """Every module that opens a file for writing is tried by `writers`, or named with a reason."""
     sources = {path.relative_to(ROOT).as_posix(): path.read_text(encoding="utf-8") for path in (ROOT / "toolkit").rglob("*.py")}
     found = {name for name, text in sources.items() if WRITES.search(text)}
-    tried = "".join((ROOT / "tests" / "stability" / name).read_text(encoding="utf-8") for name in ("writers.py", "writers_more.py"))
+    tried = (ROOT / "tests" / "stability" / "writers.py").read_text(encoding="utf-8")
     named = {
         # Behind `Field.save`, `save_views` and `simulate`.
         "toolkit/volume/store.py", "toolkit/capture/views_file.py", "toolkit/simulate/simulate.py", "toolkit/export/ply.py",
@@ -129,6 +132,7 @@ def test_leftovers_of_every_kind_are_removed_and_nothing_else(tmp_path: Path) ->
 # ------------------------------------------------------------------------------------------------ clocks, memory, company
 
 
+@pytest.mark.slow
 @LONG
 def test_a_wall_clock_that_jumps_by_a_year_changes_nothing(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     source = make_source(tmp_path / "room")
@@ -143,15 +147,6 @@ def test_a_wall_clock_that_jumps_by_a_year_changes_nothing(tmp_path: Path, monke
     assert 0 < report["seconds_total"] < time.monotonic() - began
     again = fieldfuse("run", source, "--out", tmp_path / "out", *OPTIONS, "--json")
     assert again.code == 0 and all(stage["cached"] for stage in json.loads(again.out)["stages"])
-
-
-@LONG
-def test_a_stage_that_does_not_fit_into_memory_is_refused_with_numbers(tmp_path: Path) -> None:
-    done = launch({"stage": "views", "memory": 100 * 2**20}, make_source(tmp_path / "room"), tmp_path / "out")
-    assert done.returncode == 2, done.stderr
-    sentence = Answer(done.returncode, done.stdout, done.stderr).sentence()
-    assert "GB of memory" in sentence and "is free" in sentence and "--image-size" in sentence
-    assert corrupt(tmp_path / "out") == []
 
 
 RACE = """

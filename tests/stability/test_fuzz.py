@@ -19,6 +19,7 @@ from tests.stability.fuzz.drive import ROOT, fuzz
 INPUTS = 300
 
 
+@pytest.mark.slow
 @pytest.mark.timeout(1200)
 def test_hundreds_of_damaged_files() -> None:
     result = fuzz(INPUTS, seed=int(os.environ.get("FIELDFUSE_SEED", "20")))
@@ -126,16 +127,3 @@ def test_a_worker_that_dies_is_reported_and_the_next_goes_on(tmp_path: Path, mon
     monkeypatch.setattr(drive, "subprocess", SimpleNamespace(Popen=popen, PIPE=subprocess.PIPE))
     problems = [(problem["kind"], problem["number"], problem["text"]) for problem in fuzz(20, 1).problems]
     assert problems == [("crash", 7, "ended by SIGSEGV")]
-
-
-def test_a_long_run_is_taken_up_where_it_was_left(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(drive, "ROUND", 20)
-    state, only = tmp_path / "state.json", ["points"]
-    told: list[int] = []
-    drive.fuzz_in_rounds(state, 20, 3, 1, only, lambda result: told.append(result.inputs))
-    result = drive.fuzz_in_rounds(state, 50, 3, 1, only, lambda result: told.append(result.inputs))
-    assert told == [20, 40, 50]
-    at_once = fuzz(50, 3, 2, only)
-    assert (result.inputs, result.refused, result.targets, result.problems) == (50, at_once.refused, at_once.targets, at_once.problems)
-    with pytest.raises(ValueError, match="begun with"):
-        drive.fuzz_in_rounds(state, 60, 4, 1, only)

@@ -46,7 +46,7 @@ def test_a_volume_takes_half_of_what_is_free(monkeypatch: pytest.MonkeyPatch) ->
 
 def test_matching_and_finding_poses_are_refused_before_they_begin(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     allow(monkeypatch, 2**18)
-    with pytest.raises(InputError, match=r"matching pictures .* needs about .* GB of memory and 0\.1 GB is free"):
+    with pytest.raises(InputError, match=r"matching images .* needs about .* GB of memory and 0\.1 GB is free"):
         stereo_depths(views_of(texture), 1.0, 6.0, 3.0)
     capture = written(tmp_path, CAMERA)
     monkeypatch.setattr(sfm, "plan", lambda *given: pytest.fail("the job began"))

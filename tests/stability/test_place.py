@@ -77,6 +77,7 @@ def distances(views: Views) -> Array:
     return np.asarray(np.linalg.norm(centres[:, None] - centres[None], axis=2))
 
 
+@pytest.mark.slow
 @pytest.mark.timeout(900)
 def test_place_and_size_of_the_input_change_nothing(tmp_path: Path) -> None:
     make_room(tmp_path / "room", 10, True, CAMERA.scaled(48, 36))

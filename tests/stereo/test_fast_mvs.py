@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import time
 from dataclasses import replace
 
 import numpy as np
@@ -13,7 +12,6 @@ from hypothesis import strategies as st
 from fieldfuse.capture.types import Views
 from fieldfuse.stereo import fast_mvs
 from fieldfuse.stereo.match import LONG_SIDE
-from tests.simulate.test_procedural import plain_operations
 from tests.stereo.made import FAR, MEDIAN, NEAR, corner
 
 
@@ -70,20 +68,3 @@ def test_some_pictures_are_left_out_of_many(monkeypatch: pytest.MonkeyPatch) -> 
     assert [depth is not None for depth in known.depths] == [True, False, True, False, False, True, False]
     views, matched = fast_mvs.guided(with_held_out(), NEAR, FAR, MEDIAN, 0.2)
     assert matched is None and not any(depth is not None for depth in views.depths)
-
-
-def test_a_small_picture_takes_about_what_is_reckoned_with() -> None:
-    """Within a factor of eight, on whatever machine: the share of a fit's seconds must not be off by an order.
-
-    A slower one than the nominal, where a hundred rounds of arithmetic on 320×240 rays take 0.09 s, is given as much longer.
-    """
-    views = with_held_out()
-    fast_mvs.guided(views, NEAR, FAR, MEDIAN, 1.0)
-    start = time.process_time()
-    _, matched = fast_mvs.guided(views, NEAR, FAR, MEDIAN, 1.0)
-    between = time.process_time()
-    plain_operations(320 * 240)
-    slower = max(1.0, (time.process_time() - between) / 0.09)
-    each = (between - start) / 6
-    assert matched is not None and matched.pixels == fast_mvs.LEAST_SIDE
-    assert each < 8 * slower * fast_mvs.view_seconds(fast_mvs.LEAST_SIDE, 0.75)

@@ -139,7 +139,7 @@ def test_what_cannot_be_matched_is_fitted_to_colours() -> None:
     here = replace(made, world_from_camera=np.tile(made.world_from_camera[:1], (len(made), 1, 1)))
     result = fit_guided(here, SCENE, wanted("budget=1"), ticks=steady())
     assert result.matched is None and result.steps > 0
-    assert len(result.notes) == 1 and "colours alone: no two pictures" in result.notes[0]
+    assert len(result.notes) == 1 and "colours alone: no two images" in result.notes[0]
 
 
 def test_it_can_be_stopped_while_matching() -> None:

@@ -11,7 +11,7 @@ import torch
 
 from fieldfuse.camera import Intrinsics, Similarity, pixel_grid, rays
 from fieldfuse.capture.types import Views
-from fieldfuse.config import Settings, load_settings
+from fieldfuse.config import NetworkSettings, Settings, load_settings
 from fieldfuse.errors import InputError
 from fieldfuse.evaluation.sphere import around, lens
 from fieldfuse.nerfusion.decoder import Deferred
@@ -25,7 +25,6 @@ from fieldfuse.training.from_network import (
     OBJECT_PIXELS,
     PIXELS,
     Inference,
-    NetworkOptions,
     lattice_of,
     voxels_to_median,
 )
@@ -53,12 +52,12 @@ def settings(*pairs: str) -> Settings:
     return load_settings(pairs=["field.channels=8", "field.hidden=16", "field.resolution=64", "device=cpu", "budget=1", *pairs])
 
 
-def inference(options: NetworkOptions | None = None) -> Inference:
+def inference(network: NetworkSettings | None = None) -> Inference:
     model = small_model()
     with torch.no_grad():
         model.to_field.density.weight.mul_(6)  # opinions that differ from place to place, as a trained network's do
     keys = KeyFrames(np.array([0, 2]), np.array([[1], [1]]))
-    return Inference(model.eval(), wall_views(), scene(), keys, options=options or NetworkOptions(16.0))
+    return Inference(model.eval(), wall_views(), scene(), keys, settings=network or NetworkSettings(voxels=16.0))
 
 
 def made() -> Field:
@@ -139,14 +138,14 @@ def test_held_out_views_are_never_looked_at() -> None:
     assert running.train.names == ["0", "2", "3"]
     views = wall_views()
     views.images[1] = np.zeros_like(views.images[1])
-    spoilt = Inference(running.model, views, scene(), running.keys, options=running.options)
+    spoilt = Inference(running.model, views, scene(), running.keys, settings=running.settings)
     list(running.frames())
     list(spoilt.frames())
     assert torch.equal(running.field().density_rows, spoilt.field().density_rows)
 
 
 def test_the_field_can_be_had_after_every_key_frame_and_grows() -> None:
-    running = inference(NetworkOptions(16.0, gamma=None))
+    running = inference(NetworkSettings(voxels=16.0, gamma=1.0))
     with pytest.raises(InputError, match="no key frame"):
         running.field()
     voxels = [running.field().voxels for _ in running.frames()]
@@ -181,7 +180,7 @@ def test_what_lies_outside_of_the_silhouettes_is_left_out() -> None:
     made = []
     for some in (views, cut):
         keys = KeyFrames(np.array([0, 2]), np.array([[1], [1]]))
-        running = Inference(inference().model, some, scene(), keys, "off", NetworkOptions(32.0))
+        running = Inference(inference().model, some, scene(), keys, "off", NetworkSettings(voxels=32.0))
         list(running.frames())
         made.append(running.field())
     whole, carved = made

@@ -14,7 +14,7 @@ from __future__ import annotations
 
 import os
 from functools import cache
-from importlib import util
+from importlib import import_module, util
 from typing import Any
 
 import numpy as np
@@ -35,6 +35,17 @@ def _installed() -> bool:
 def can_use_triton(*values: Tensor, dtypes: tuple[torch.dtype, ...] | None = (torch.float32,)) -> bool:
     """Whether Triton's kernels can take all of `values`: they lie on a CUDA device and are of one of `dtypes` (None: any)."""
     return all(value.is_cuda and (dtypes is None or value.dtype in dtypes) for value in values) and _installed()
+
+
+def can_use_numba(*values: Tensor) -> bool:
+    """Whether compiled kernels for the CPU can take all of `values`."""
+    return all(value.device.type == "cpu" and value.dtype == torch.float32 for value in values)
+
+
+def kernels(name: str, *values: Tensor) -> Any:
+    """The module `name` of kernels that take `values` where they lie, `backends/numba/` or `backends/triton/`; None: torch computes."""
+    backend = "numba" if can_use_numba(*values) else "triton" if can_use_triton(*values) else None
+    return None if backend is None else import_module(f"fieldfuse.backends.{backend}.{name}")
 
 
 def triton_runs_on(device: torch.device) -> bool:

@@ -1,7 +1,7 @@
 """Block-sparse 3×3×3 convolution on rows: one gather of each block's 10³ halo, one dense `conv3d`, and the occupancy mask.
 
 Rows stay [voxels, channels] throughout: a halo read as (n, 10, 10, 10, C) is already the channels-last-3d memory that `conv3d` likes,
-so nothing is ever transposed. The input's gradient is the same kind of convolution, with the kernel flipped, on the haloed gradient,
+so nothing is transposed. The input's gradient is the same kind of convolution, with the kernel flipped, on the haloed gradient,
 which is exact and needs no scatter.
 """
 
@@ -41,9 +41,6 @@ class BlockConv3d(nn.Module):
         self.bias = nn.Parameter(torch.empty(out_channels)) if bias else None
         self.chunk = chunk
         self._prepared = Prepared()
-        self.reset_parameters()
-
-    def reset_parameters(self) -> None:
         nn.init.kaiming_normal_(self.weight, nonlinearity="relu")
         if self.bias is not None:
             nn.init.zeros_(self.bias)
@@ -53,9 +50,6 @@ class BlockConv3d(nn.Module):
         if not torch.is_grad_enabled() and dispatch.can_use_triton(rows, dtypes=dispatch.FLOATS):
             return self._prepared.convolve([[self]], rows, topology, occupied, relu)
         return block_conv3d(rows, topology, self.weight, self.bias, occupied, self.chunk, relu)
-
-    def extra_repr(self) -> str:
-        return f"{self.weight.shape[1]}, {self.weight.shape[0]}, bias={self.bias is not None}"
 
 
 Stage = Sequence[BlockConv3d]  # one convolution, or several that go side by side
@@ -72,22 +66,16 @@ class Prepared:
     def convolve(
         self, stages: Sequence[Stage], rows: Tensor, topology: Topology, occupied: Tensor | None = None, relu: bool = False
     ) -> Tensor:
-        """`block_conv3d` of one stage after the other, with a ReLU between them, a launch each.
+        """`block_conv3d` of rows (M · 512 + 1, C) by one stage after the other, with a ReLU between them (with `relu` also before), a
+        launch each → (M · 512 + 1, C'), one layer's channels after the other's.
 
-        Args:
-            stages: layers of one stage are alike in shape, and have all a bias or none. Those of the first read the same rows, those of
-                later ones each its own part of the channels.
-            rows: (M · 512 + 1, C).
-            relu: of the rows, before.
-
-        Returns:
-            (M · 512 + 1, C'), one layer's channels after the other's.
+        Layers of a stage are alike in shape, and have all a bias or none. Those of the first read the same rows, those of later ones each
+        its own part of the channels.
         """
         from fieldfuse.backends.triton import convolution
 
-        kind = rows.device.type
-        numbers = torch.get_autocast_dtype(kind) if torch.is_autocast_enabled(kind) else rows.dtype
-        rows, around = rows if rows.dtype == numbers else rows.to(numbers), topology.around
+        numbers, around = computed_in(rows), topology.around
+        rows = rows.to(numbers)
         for taps, bias in self._parameters(stages, numbers):
             rows = convolution.convolve(rows, around, taps, bias, occupied, relu)
             relu = True
@@ -107,6 +95,12 @@ class Prepared:
                 self._laid.append((taps.to(numbers), torch.cat(biases).to(numbers) if biases else None))
             self._key = key
         return self._laid
+
+
+def computed_in(rows: Tensor) -> torch.dtype:
+    """The numbers that autocast computes in, else those of the rows."""
+    kind = rows.device.type
+    return torch.get_autocast_dtype(kind) if torch.is_autocast_enabled(kind) else rows.dtype
 
 
 def block_conv3d(
@@ -139,18 +133,7 @@ def block_conv3d(
         raise ValueError(f"occupied must have {topology.zero_row} entries, not {tuple(occupied.shape)}")
     if topology.blocks == 0:
         return rows.new_zeros((len(rows), len(weight)))
-    kind = rows.device.type
-    reduced = torch.get_autocast_dtype(kind) if torch.is_autocast_enabled(kind) else None
-    if not torch.is_grad_enabled() and dispatch.can_use_triton(rows, dtypes=dispatch.FLOATS):
-        from fieldfuse.backends.triton import convolution
-
-        numbers = reduced or rows.dtype
-        taps, added = convolution.taps_of(weight.to(numbers)), None if bias is None else bias.to(numbers)
-        out = convolution.convolve(rows.to(numbers), topology.around, taps, added, occupied, relu)
-        return out if len(rows) > topology.zero_row else out[:-1]
-    if relu:
-        rows = torch.relu(rows)
-    result: Tensor = _BlockConv.apply(rows, weight, bias, topology, occupied, chunk, reduced)
+    result: Tensor = _BlockConv.apply(torch.relu(rows) if relu else rows, weight, bias, occupied, topology, chunk)
     return result
 
 
@@ -201,17 +184,10 @@ def _convolve(rows: Tensor, weight: Tensor, bias: Tensor | None, topology: Topol
 class _BlockConv(torch.autograd.Function):
     @staticmethod
     def forward(
-        ctx: Any,
-        rows: Tensor,
-        weight: Tensor,
-        bias: Tensor | None,
-        topology: Topology,
-        occupied: Tensor | None,
-        chunk: int,
-        reduced: torch.dtype | None,
+        ctx: Any, rows: Tensor, weight: Tensor, bias: Tensor | None, occupied: Tensor | None, topology: Topology, chunk: int
     ) -> Tensor:
         ctx.save_for_backward(rows, weight, occupied)
-        ctx.topology, ctx.chunk, ctx.kind, ctx.biased = topology, chunk, reduced or rows.dtype, bias is not None
+        ctx.topology, ctx.chunk, ctx.kind, ctx.biased = topology, chunk, computed_in(rows), bias is not None
         with torch.autocast(rows.device.type, enabled=False):
             padded = _with_zero_row(rows, topology, ctx.kind)
             bias = bias.to(ctx.kind) if bias is not None else None
@@ -236,7 +212,7 @@ class _BlockConv(torch.autograd.Function):
                 to_weight = _weight_gradient(_with_zero_row(rows, topology, kind), padded, weight, topology, ctx.chunk)
             if ctx.biased and ctx.needs_input_grad[2]:
                 to_bias = padded.sum(0, dtype=weight.dtype)
-        return to_rows, to_weight, to_bias, None, None, None, None
+        return to_rows, to_weight, to_bias, None, None, None
 
 
 def _weight_gradient(rows: Tensor, gradient: Tensor, weight: Tensor, topology: Topology, chunk: int) -> Tensor:

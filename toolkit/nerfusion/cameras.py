@@ -1,9 +1,10 @@
-"""Pinhole cameras as tensors, for the networks: a few views at a time, in the working frame."""
+"""Pinhole cameras as tensors, for the networks: a few views at a time, in the working frame; and the blocks of a lattice that they see."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field
+from functools import lru_cache
 
 import numpy as np
 import torch
@@ -11,46 +12,32 @@ from torch import Tensor
 
 from fieldfuse.backends.dispatch import to_device_async
 from fieldfuse.camera import Array, Intrinsics
+from fieldfuse.nerfusion.lattice import Lattice
+from fieldfuse.volume.topology import BLOCK, Topology
+
+SLACK = 1.25  # balls grow by this much: views see a voxel beside their images, and blocks of the contracted shell are bent
 
 
 @dataclass(frozen=True)
 class Cameras:
-    """K cameras with OpenCV axes and pixel centres at +0.5.
+    """K cameras with OpenCV axes and pixel centres at +0.5."""
 
-    Attributes:
-        intrinsics: (K, 4) fx, fy, cx, cy in pixels.
-        size: (K, 2) width and height in pixels.
-        world_from_camera: (K, 4, 4).
-        host: the same cameras in the processor's memory, where they came from there, so that asking for them does not wait for the device.
-    """
-
-    intrinsics: Tensor
-    size: Tensor
-    world_from_camera: Tensor
+    intrinsics: Tensor  # (K, 4) fx, fy, cx, cy in pixels
+    size: Tensor  # (K, 2) width and height in pixels
+    world_from_camera: Tensor  # (K, 4, 4)
+    # The same cameras in the processor's memory, where they came from there, so that reading them does not wait for the device.
     host: Cameras | None = field(default=None, compare=False, repr=False)
 
     @classmethod
     def of(cls, intrinsics: Sequence[Intrinsics], world_from_camera: Array, device: torch.device | str = "cpu") -> Cameras:
-        """From the toolkit's cameras; lenses are not looked at (pictures are undistorted before)."""
-        inner = [(c.fx, c.fy, c.cx, c.cy) for c in intrinsics]
-        parts = inner, [(c.width, c.height) for c in intrinsics], world_from_camera
-        return cls._laid(np.concatenate([np.asarray(part, dtype=np.float32).reshape(-1) for part in parts]), torch.device(device))
-
-    @classmethod
-    def _laid(cls, whole: Array, device: torch.device) -> Cameras:
-        """Cameras of (22 · K,) float32: all intrinsics, then all sizes, then all poses; sent to the device in one piece."""
-        count = len(whole) // 22
-
-        def split(values: Tensor, host: Cameras | None) -> Cameras:
-            inner, size, poses = values.split([4 * count, 2 * count, 16 * count])
-            return cls(inner.view(-1, 4), size.view(-1, 2), poses.view(-1, 4, 4), host)
-
-        host = split(torch.from_numpy(whole), None)
-        return host if device.type == "cpu" else split(to_device_async(whole, device), host)
+        """From the toolkit's cameras; lenses are not looked at (images are undistorted before)."""
+        lenses = np.array([(c.fx, c.fy, c.cx, c.cy) for c in intrinsics], np.float32)
+        sizes = np.array([(c.width, c.height) for c in intrinsics], np.float32)
+        return cls(*map(torch.from_numpy, (lenses, sizes, np.asarray(world_from_camera).astype(np.float32)))).to(device)
 
     @classmethod
     def same_size(cls, intrinsics: Tensor, world_from_camera: Tensor, width: int, height: int) -> Cameras:
-        """(K, 4) and (K, 4, 4) of pictures of one size."""
+        """(K, 4) and (K, 4, 4) of images of one size."""
         return cls(intrinsics, intrinsics.new_tensor([width, height]).expand(len(intrinsics), 2), world_from_camera)
 
     def __len__(self) -> int:
@@ -68,28 +55,20 @@ class Cameras:
         """All of them in one bundle."""
         hosts = [part.host for part in parts if part.host is not None]
         if hosts and len(hosts) == len(parts):
-            groups = zip(*((one.intrinsics, one.size, one.world_from_camera) for one in hosts), strict=True)
-            whole = np.concatenate([one.numpy().reshape(-1) for group in groups for one in group])
-            return cls._laid(whole, parts[0].intrinsics.device)
-        return cls(
-            torch.cat([part.intrinsics for part in parts]),
-            torch.cat([part.size for part in parts]),
-            torch.cat([part.world_from_camera for part in parts]),
-        )
+            return cls.together(hosts).to(parts[0].intrinsics.device)
+        return cls(*(torch.cat([getattr(part, name) for part in parts]) for name in ("intrinsics", "size", "world_from_camera")))
 
     def to(self, device: torch.device | str) -> Cameras:
         """The same cameras on another device, in one piece."""
-        device = torch.device(device)
+        device, on_cpu = torch.device(device), self.intrinsics.device.type == "cpu"
         if device.type == self.intrinsics.device.type:
             return self
         if device.type == "cpu" and self.host is not None:
             return self.host
         parts = self.intrinsics, self.size, self.world_from_camera
-        if self.intrinsics.device.type == "cpu":
-            return self._laid(np.concatenate([part.numpy().reshape(-1) for part in parts]), device)
-        # What comes back is waited for.
-        moved = torch.cat([part.reshape(-1) for part in parts]).to(device).split([part.numel() for part in parts])
-        return Cameras(*(new.view(old.shape) for new, old in zip(moved, parts, strict=True)))
+        flat = torch.cat([part.reshape(-1) for part in parts])
+        moved = (to_device_async(flat.numpy(), device) if on_cpu else flat.to(device)).split([part.numel() for part in parts])
+        return Cameras(*(new.view(old.shape) for new, old in zip(moved, parts, strict=True)), self if on_cpu else None)
 
     @property
     def positions(self) -> Tensor:
@@ -113,3 +92,65 @@ class Cameras:
         ray = torch.stack([(pixels[:, 0] - cx) / fx, (pixels[:, 1] - cy) / fy, torch.ones_like(pixels[:, 0])], 1)
         with torch.autocast(pixels.device.type, enabled=False):
             return torch.nn.functional.normalize(ray @ self.world_from_camera[view, :3, :3].T, dim=1)
+
+
+# Blocks that a camera can see at all, judged before anything is unprojected, in the processor's memory: there an operation on a few numbers
+# is cheap, and the device is not waited for.
+
+
+def all_blocks(lattice: Lattice) -> Tensor:
+    """(M, 3) int32 keys of every block that holds a corner of the space (without a shell: of its box)."""
+    space = lattice.space
+    line = torch.arange(lattice.resolution // BLOCK + 1)
+    z, y, x = torch.meshgrid(line, line, line, indexing="ij")
+    keys = torch.stack([x, y, z], -1).view(-1, 3)
+    if space.shell == 0:
+        box = torch.tensor(space.box) + lattice.voxel
+        low = keys * (BLOCK * lattice.voxel) - space.extent
+        high = low + (BLOCK - 1) * lattice.voxel
+        keys = keys[((low <= box) & (high >= -box)).all(1)]
+    return keys.int()
+
+
+def block_balls(lattice: Lattice, keys: Tensor) -> tuple[Tensor, Tensor]:
+    """(M, 3) keys → centres (M, 3) and radii (M,) of balls around each block's corners, working frame."""
+    offsets = torch.tensor([[x, y, z] for z in (0, 1) for y in (0, 1) for x in (0, 1)]) * (BLOCK - 1)
+    corners = (keys[:, None].long() * BLOCK + offsets).float() * lattice.voxel - lattice.space.extent
+    centre = lattice.space.to_working(corners.mean(1))
+    radius = (lattice.space.to_working(corners.view(-1, 3)).view(-1, 8, 3) - centre[:, None]).norm(dim=2).amax(1)
+    return centre, radius * SLACK
+
+
+@lru_cache(maxsize=4)
+def _all_balls(lattice: Lattice) -> tuple[Array, Array, Array]:
+    """Keys, centres and radii of all blocks of a lattice."""
+    keys = all_blocks(lattice)
+    centres, radii = block_balls(lattice, keys)
+    return keys.numpy(), centres.numpy(), radii.numpy()
+
+
+def frustum(lattice: Lattice, camera: Cameras, near: float, far: float, device: torch.device | str = "cpu") -> Topology:
+    """The blocks of the lattice in the first camera's frustum between the depths `near` and `far` (never too few)."""
+    keys, centres, radii = _all_balls(lattice)
+    kept = keys[visible(centres, radii, camera, near, far)]
+    return Topology(to_device_async(kept, torch.device(device)), bounds=lattice.bounds(device), host=kept)
+
+
+def visible(centres: Array, radii: Array, camera: Cameras, near: float, far: float) -> Array:
+    """(M,) bool: a part of the ball lies in the first camera's frustum, inside each of its six planes."""
+    camera = camera[0].to("cpu")
+    (fx, fy, cx, cy), (width, height), pose = camera.intrinsics[0].tolist(), camera.size[0].tolist(), camera.world_from_camera[0].numpy()
+    sides = [[fx, 0, cx], [-fx, 0, width - cx], [0, fy, cy], [0, -fy, height - cy], [0, 0, 1], [0, 0, -1]]
+    local = np.array(sides, np.float32)
+    world = local / np.linalg.norm(local, axis=1, keepdims=True) @ pose[:3, :3].T  # unit normals, inwards
+    offsets = np.array([0, 0, 0, 0, -near, min(far, 1e30)], np.float32) - world @ pose[:3, 3]
+    return np.asarray((centres @ world.T + offsets + radii[:, None] > 0).all(1))
+
+
+def depth_range(lattice: Lattice, topology: Topology, camera: Cameras) -> tuple[float, float]:
+    """Where the blocks begin (0: at the camera) and end along the first camera's axis, working units."""
+    if topology.blocks == 0:
+        return 1.0, 2.0
+    centres, radii = block_balls(lattice, torch.from_numpy(topology.host))
+    depth = camera[0].to("cpu").local(centres)[0, :, 2]
+    return max(float((depth - radii).amin()), 0.0), max(float((depth + radii).amax()), 1e-6)

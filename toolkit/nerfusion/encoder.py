@@ -1,9 +1,9 @@
-"""The image encoder: one map of 64 channels at a quarter of the picture's size, a feature pyramid fused top down, and what of it voxels
-look up at half the size.
+"""The image encoder: one map of 64 channels at a quarter of the image's size, a feature pyramid fused top down, and what of it voxels
+look up at half the size; and the code of a viewing direction.
 
 Every stride-2 convolution has an even kernel, so cell j of a map of stride s is centred at s · (j + ½) pixels exactly; unprojection
 relies on it. Normalisation by groups keeps the layers alive from the first step on (plain deep stacks die without notice), and the last
-one, of each channel over the picture, keeps what comes out different from place to place: with groups there, training let it sink to a
+one, of each channel over the image, keeps what comes out different from place to place: with groups there, training let it sink to a
 deviation of 0.15 and learned more slowly.
 """
 
@@ -20,12 +20,13 @@ from fieldfuse.errors import InputError
 from fieldfuse.nerfusion import lite
 
 STRIDE = 2  # pixels a cell of what voxels look up
-DEEPEST = 16  # pixels a cell of the deepest level; pictures are padded to multiples of it
+DEEPEST = 16  # pixels a cell of the deepest level; images are padded to multiples of it
 GROUP = 8  # channels normalised together
-MEAN, DEVIATION = (0.485, 0.456, 0.406), (0.229, 0.224, 0.225)  # of ImageNet's pictures, RGB
+MEAN, DEVIATION = (0.485, 0.456, 0.406), (0.229, 0.224, 0.225)  # of ImageNet's images, RGB
 WIDTHS = (16, 32, 48, 96)  # channels at 1/2, 1/4, 1/8 and 1/16
 SMALL, LITE0 = "small", "lite0"
 TRUNKS = (SMALL, LITE0)
+LAYERS = 5  # of the direction code
 
 
 class _Conv(nn.Sequential):
@@ -59,7 +60,7 @@ class ImageEncoder(nn.Module):
         widths: channels of the levels at 1/2, 1/4, 1/8 and 1/16.
     """
 
-    mean: Tensor  # of ImageNet's pictures, (3, 1, 1)
+    mean: Tensor  # of ImageNet's images, (3, 1, 1)
     deviation: Tensor
 
     def __init__(self, channels: int = 64, trunk: str = SMALL) -> None:
@@ -108,7 +109,7 @@ class ImageEncoder(nn.Module):
 
 
 class Sampled(nn.Module):
-    """What voxels look up: few channels of the fused map, enlarged, plus detail from the stem, at half the picture's size.
+    """What voxels look up: few channels of the fused map, enlarged, plus detail from the stem, at half the image's size.
 
     A voxel's step in depth moves its pixel by about one pixel only, so a map of a quarter of the size cannot tell neighbouring voxels
     apart.
@@ -136,3 +137,20 @@ def padded(images: Tensor) -> Tensor:
     height, width = images.shape[-2:]
     right, below = -width % DEEPEST, -height % DEEPEST
     return F.pad(images, (0, right, 0, below), mode="replicate") if right or below else images
+
+
+class DirectionCode(nn.Sequential):
+    """G, the direction code of NeRFusion (section 3.1), an MLP of five layers: (N, 3) unit directions, working frame → (N, channels)."""
+
+    def __init__(self, channels: int = 16) -> None:
+        layers: list[nn.Module] = []
+        for number in range(LAYERS):
+            linear = nn.Linear(3 if number == 0 else channels, channels)
+            nn.init.kaiming_normal_(linear.weight, nonlinearity="relu" if number < LAYERS - 1 else "linear")
+            nn.init.zeros_(linear.bias)
+            layers += [linear, nn.ReLU()]
+        super().__init__(*layers[:-1])
+
+    def forward(self, directions: Tensor) -> Tensor:
+        codes: Tensor = super().forward(directions)
+        return codes

@@ -16,12 +16,13 @@ from __future__ import annotations
 from itertools import pairwise
 
 import torch
+import torch.nn.functional as F
 from torch import Tensor, nn
 
 from fieldfuse.backends.constants import CHANGE, INSIDE
-from fieldfuse.nerfusion.block_conv import BlockConv3d, Prepared, block_conv3d
-from fieldfuse.nerfusion.compiled_gru import Step
-from fieldfuse.nerfusion.extras.bounded_outputs import bounded
+from fieldfuse.backends.dispatch import is_cpu
+from fieldfuse.nerfusion.block_conv import BlockConv3d, Prepared, block_conv3d, computed_in
+from fieldfuse.nerfusion.extras.known_terms import bounded
 from fieldfuse.nerfusion.lattice import LatentVolume, LocalVolume
 from fieldfuse.volume.topology import Topology
 
@@ -45,82 +46,62 @@ class _Gate(nn.Module):
     def layers(self) -> list[BlockConv3d]:
         return [layer for layer in self.convolutions if isinstance(layer, BlockConv3d)]
 
-    @property
-    def first(self) -> BlockConv3d:
-        return self.layers[0]
-
     def forward(self, rows: Tensor, topology: Topology, inside: Tensor, begun: Tensor | None = None) -> Tensor:
         """`begun`: what the first convolution gives for `rows`, if that is known already."""
-        rows = self.first(rows, topology, inside) if begun is None else begun
+        rows = self.layers[0](rows, topology, inside) if begun is None else begun
         for convolution in self.convolutions[1:]:
             rows = convolution(rows, topology, inside, True)
         return rows
 
 
 class FusionGRU(nn.Module):
-    """One step of the recurrence on the voxels of a local volume.
+    """One step of the recurrence on the voxels of a local volume."""
 
-    Args:
-        most: cap on n.
-    """
-
-    def __init__(self, channels: int, hidden: int, layers: int = 3, most: int = MOST) -> None:
+    def __init__(self, channels: int, hidden: int, layers: int = 3) -> None:
         super().__init__()
         self.update, self.reset, self.candidate = (_Gate(channels, hidden, layers) for _ in range(3))
-        self.most = most
         self._gates_prepared, self._candidate_prepared = Prepared(), Prepared()
 
-    def forward(
-        self, state: Tensor, count: Tensor, local: Tensor, raw: Tensor, weight: Tensor, topology: Topology, inside: Tensor
-    ) -> Tensor:
-        """H' on the local volume's rows.
+    def forward(self, state: LatentVolume, local: LocalVolume) -> Tensor:
+        """(M · 512 + 1, C) H' on the local volume's blocks, zero where nothing is known there.
 
         Args:
-            state: (M · 512 + 1, C) H, zero outside the local volume and where nothing is known.
-            count, weight: (M · 512,) n and w.
-            local, raw: (M · 512 + 1, C) V and V_raw.
-            inside: (M · 512,) bool, the voxels of the local volume.
-
-        Returns:
-            (M · 512 + 1, C), zero outside.
+            state: H and n there, zero where the local volume is unknown.
         """
-        both = _beside(state, local)
-        known = torch.log(count.clamp_max(self.most)) - torch.log(weight.clamp_min(LEAST))  # −∞ where nothing is known: z = 1
-        known = torch.cat([known, known.new_full((1,), -torch.inf)])[:, None]
-        update, reset = self._gates(both, topology, inside)
+        topology, inside, h, v = local.topology, local.known, state.rows, local.rows
+        known = torch.log(state.count.clamp_max(MOST)) - torch.log(local.weight.clamp_min(LEAST))
+        known = F.pad(known, (0, 1), value=-torch.inf)[:, None]  # −∞ where nothing is known: z = 1
+        update, reset = self._gates(_beside(h, v), topology, inside)
         z, r = torch.sigmoid(update - known), torch.sigmoid(reset)
-        candidate = torch.tanh(raw + bounded(self.candidate(_beside(r * state, local), topology, inside)))
-        return torch.lerp(state, candidate, z)
+        candidate = torch.tanh(local.raw + bounded(self.candidate(_beside(r * h, v), topology, inside)))
+        return torch.lerp(h, candidate, z)
 
     def compiled(self, part: LatentVolume, local: LocalVolume) -> tuple[Tensor, Tensor]:
         """The running mean on all rows of `part` (the global volume on the local one's blocks) and `forward` on blocks near surfaces,
-        without gradients, by kernels (float32; convolutions in what autocast says).
+        without gradients, by kernels (float32; convolutions in the numbers of autocast).
 
         Returns:
             (M · 512 + 1, C), zero outside the local volume, and (M · 512,) weights so far, likewise.
         """
-        kind, near_surface = part.rows.device.type, local.near_surface
-        numbers = torch.get_autocast_dtype(kind) if torch.is_autocast_enabled(kind) else torch.float32
-        if not on_cpu(part.rows.device):
-            return self._on_device(part, local, numbers)
-        step = Step(local.place[:-1], part, local, LEAST, self.most)
-        rows = step.average()
-        if near_surface.blocks:
-            inside = local.known[local.place[:-1]]
-            both = step.beside(numbers)
-            update, reset = self._gates(both, near_surface, inside)
-            step.forget(reset, both)
-            step.update(update, self.candidate(both, near_surface, inside), INSIDE, CHANGE, rows)
-        return rows, part.count * local.known + local.weight
+        near_surface = local.near_surface
+        if is_cpu(part.rows.device):
+            from fieldfuse.backends.numba import gru as on_cpu
 
-    def _on_device(self, part: LatentVolume, local: LocalVolume, numbers: torch.dtype) -> tuple[Tensor, Tensor]:
-        """`compiled` on CUDA: both gates' convolutions go side by side."""
-        from fieldfuse.backends.triton import gru
+            one = on_cpu.Step(local.place[:-1], part, local, LEAST, MOST)
+            rows = one.average()
+            if near_surface.blocks:
+                inside, both = local.known[local.place[:-1]], one.beside()
+                update, reset = self._gates(both, near_surface, inside)
+                one.forget(reset, both)
+                one.update(update, self.candidate(both, near_surface, inside), INSIDE, CHANGE, rows)
+            return rows, part.count * local.known + local.weight
+        from fieldfuse.backends.triton import volumes as on_cuda
 
-        step, near_surface = gru.Step(part, local, LEAST, self.most), local.near_surface
+        # Both gates' convolutions go side by side.
+        step = on_cuda.Step(part, local, LEAST, MOST)
         rows, count = step.average()
         if near_surface.blocks:
-            both, inside = step.beside(numbers)
+            both, inside = step.beside(computed_in(part.rows))
             gates = self._gates_prepared.convolve(list(zip(self.update.layers, self.reset.layers, strict=True)), both, near_surface, inside)
             step.forget(gates, both)
             candidate = self._candidate_prepared.convolve([[layer] for layer in self.candidate.layers], both, near_surface, inside)
@@ -129,43 +110,30 @@ class FusionGRU(nn.Module):
 
     def _gates(self, both: Tensor, topology: Topology, inside: Tensor) -> list[Tensor]:
         """M_z and M_r of [H, V]; their first convolutions are one, which costs as much as either alone."""
-        one, other = self.update.first, self.reset.first
+        one, other = self.update.layers[0], self.reset.layers[0]
         assert one.bias is not None and other.bias is not None
         weight, bias = torch.cat([one.weight, other.weight]), torch.cat([one.bias, other.bias])
         rows = block_conv3d(both, topology, weight, bias, inside, one.chunk)
         return [gate(both, topology, inside, part) for gate, part in zip((self.update, self.reset), rows.chunk(2, 1), strict=True)]
 
 
-def on_cpu(device: torch.device) -> bool:
-    return device.type == "cpu"
-
-
 def _beside(one: Tensor, other: Tensor) -> Tensor:
     """Both rows' channels; without gradients at once in the numbers that convolutions compute in, which is half as much to write."""
-    kind = one.device.type
-    if torch.is_autocast_enabled(kind) and not torch.is_grad_enabled():
-        reduced = torch.get_autocast_dtype(kind)
-        one, other = one.to(reduced), other.to(reduced)
+    if not torch.is_grad_enabled():
+        one, other = one.to(computed_in(one)), other.to(computed_in(other))
     return torch.cat([one, other], 1)
 
 
-def mean_gate(count: Tensor, weight: Tensor, most: int = MOST) -> Tensor:
+def mean_gate(count: Tensor, weight: Tensor) -> Tensor:
     """(M · 512,) n and w → (M · 512 + 1, 1) the z of the weighted running mean; the last row's is one."""
     weight = weight.clamp_min(LEAST)
-    z = weight / (weight + count.clamp_max(most))
+    z = weight / (weight + count.clamp_max(MOST))
     return torch.cat([z, z.new_ones(1)])[:, None]
 
 
 class RunningMean(nn.Module):
     """The fusion without learning, for the ablation: the weighted mean of the local volumes, n capped as in the GRU."""
 
-    def __init__(self, most: int = MOST) -> None:
-        super().__init__()
-        self.most = most
-
-    def forward(
-        self, state: Tensor, count: Tensor, local: Tensor, raw: Tensor, weight: Tensor, topology: Topology, inside: Tensor
-    ) -> Tensor:
+    def forward(self, state: LatentVolume, local: LocalVolume) -> Tensor:
         """See `FusionGRU.forward`."""
-        z = mean_gate(count, weight, self.most)
-        return torch.lerp(state, local, z)
+        return torch.lerp(state.rows, local.rows, mean_gate(state.count, local.weight))

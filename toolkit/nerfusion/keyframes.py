@@ -14,11 +14,13 @@ from typing import Any
 import numpy as np
 
 from fieldfuse.camera import Array, Intrinsics
+from fieldfuse.config import KeyframesSettings
 from fieldfuse.errors import InputError
 from fieldfuse.poses.overlap import best_neighbours, overlap, parallax
 
-BY_PARALLAX = "parallax"
-UNIFORM = "uniform"
+METHODS = PARALLAX, UNIFORM = "parallax", "uniform"
+MIN_PARALLAX = 5.0  # degrees, baseline against the median depth, from which on a frame differs from a key frame …
+MAX_OVERLAP = 0.8  # … or so much overlap (rotation)
 VIEWS = 3  # K in the paper: a key frame and K − 1 neighbours
 BLURRED = 0.8  # of the sharpness of a frame beside it: a key frame that gives way to that one
 
@@ -38,78 +40,68 @@ class KeyFrames:
         indices = np.array(data["indices"], dtype=np.int64)
         return cls(indices, np.array(data["neighbours"], dtype=np.int64).reshape(len(indices), -1))
 
+    def group(self, at: int) -> list[int]:
+        """The key frame at a position and its neighbours, each once."""
+        return list(dict.fromkeys([int(self.indices[at]), *(int(index) for index in self.neighbours[at])]))
+
 
 def select_keyframes(
     world_from_camera: Array,
     intrinsics: Sequence[Intrinsics],
     median_depth: float,
-    *,
-    method: str = BY_PARALLAX,
-    most: int | None = None,
+    wanted: KeyframesSettings | None = None,
     views: int = VIEWS,
-    min_parallax: float = 5.0,
-    max_overlap: float = 0.8,
-    every: int = 10,
     sharpness: Array | None = None,
 ) -> KeyFrames:
     """Choose key frames among posed frames, and K − 1 neighbours for each among all frames.
 
-    `parallax`: greedy in the given order. A frame is taken when it differs from every key frame so far: by more than
-    `min_parallax` degrees of parallax (baseline against `median_depth`), or by an overlap below `max_overlap` (rotation). With
-    `sharpness`, a blurred key frame then gives way to the sharpest of the frames that stand within half of these bounds from it.
-    `uniform`: each `every`-th frame, as in the paper.
+    `parallax`: greedy in the given order. A frame is taken when it differs from every key frame so far, by `MIN_PARALLAX` or `MAX_OVERLAP`.
+    With `sharpness`, a blurred key frame then gives way to the sharpest of the frames that stand within half of these bounds from it.
+    `uniform`: every n-th frame, as in the paper.
 
     Args:
         world_from_camera: (N, 4, 4), in the frame that `median_depth` is measured in.
-        most: at most this many; beyond it, those are kept that are farthest from each other.
+        wanted: method and numbers; beyond `most` key frames, those are chosen that are farthest from each other.
         views: K, 2 or more.
-        sharpness: (N,) of any unit, comparable between frames that show nearly the same; None: not looked at.
+        sharpness: (N,) of any unit, comparable between frames that show nearly the same.
 
     Raises:
         InputError: no frames, a depth that is not positive, or an unknown method.
     """
-    poses = np.asarray(world_from_camera, dtype=np.float64)
+    poses, wanted = np.asarray(world_from_camera, dtype=np.float64), wanted or KeyframesSettings()
     if len(poses) == 0 or len(poses) != len(intrinsics):
         raise InputError(f"key frames need as many poses as cameras and at least one; there are {len(poses)} and {len(intrinsics)}")
     if not (np.isfinite(median_depth) and median_depth > 0):
         raise InputError(f"key frames need a positive scene depth, not {median_depth:g}")
-    if method not in (BY_PARALLAX, UNIFORM):
-        raise InputError(f"there is no way {method!r} to choose key frames; known are {BY_PARALLAX}, {UNIFORM}")
-    if views < 2 or every < 1 or (most is not None and most < 1):
-        raise InputError(f"key frames need views ≥ 2, every ≥ 1 and most ≥ 1; there are {views}, {every} and {most}")
+    if wanted.method not in METHODS:
+        raise InputError(f"there is no way {wanted.method!r} to choose key frames; known are {', '.join(METHODS)}")
+    if views < 2 or wanted.every < 1 or wanted.most < 1:
+        raise InputError(f"key frames need views ≥ 2, every ≥ 1 and most ≥ 1; there are {views}, {wanted.every} and {wanted.most}")
     shares = overlap(poses, intrinsics, median_depth)
     angles = parallax(poses, median_depth)
-    if method == UNIFORM:
-        chosen = list(range(0, len(poses), every))
-        if most is not None and len(chosen) > most:
-            chosen = [chosen[i] for i in np.linspace(0, len(chosen) - 1, most).round().astype(int)]
+    if wanted.method == UNIFORM:
+        chosen = list(range(0, len(poses), wanted.every))
+        if len(chosen) > wanted.most:
+            chosen = [chosen[i] for i in np.linspace(0, len(chosen) - 1, wanted.most).round().astype(int)]
     else:
-        chosen = _greedy(shares, angles, min_parallax, max_overlap)
+        common, angle = np.minimum(shares, shares.T), np.minimum(angles, angles.T)
+        chosen = [0]
+        for i in range(1, len(poses)):
+            if np.all((angle[i, chosen] > MIN_PARALLAX) | (common[i, chosen] < MAX_OVERLAP)):
+                chosen.append(i)
         if sharpness is not None:
-            chosen = _sharper(chosen, np.asarray(sharpness), shares, angles, min_parallax, max_overlap)
-        if most is not None and len(chosen) > most:
-            chosen = _farthest(poses, median_depth, chosen, most)
+            chosen = _sharper(chosen, np.asarray(sharpness), common, angle)
+        if len(chosen) > wanted.most:
+            chosen = _farthest(poses, median_depth, chosen, wanted.most)
     indices = np.array(sorted(chosen), dtype=np.int64)
     return KeyFrames(indices, best_neighbours(poses, shares, angles, views - 1)[indices])
 
 
-def _greedy(shares: Array, angles: Array, min_parallax: float, max_overlap: float) -> list[int]:
-    chosen = [0]
-    for i in range(1, len(shares)):
-        common = np.minimum(shares[i, chosen], shares[chosen, i])
-        angle = np.minimum(angles[i, chosen], angles[chosen, i])
-        if np.all((angle > min_parallax) | (common < max_overlap)):
-            chosen.append(i)
-    return chosen
-
-
-def _sharper(chosen: list[int], sharpness: Array, shares: Array, angles: Array, min_parallax: float, max_overlap: float) -> list[int]:
+def _sharper(chosen: list[int], sharpness: Array, common: Array, angle: Array) -> list[int]:
     """Blurred ones of `chosen` replaced by much sharper frames from nearly the same place; never two by the same."""
     kept = set(chosen)
     for index in chosen:
-        common = np.minimum(shares[index], shares[:, index])
-        angle = np.minimum(angles[index], angles[:, index])
-        beside = (angle <= 0.5 * min_parallax) & (common >= 0.5 * (1 + max_overlap))
+        beside = (angle[index] <= 0.5 * MIN_PARALLAX) & (common[index] >= 0.5 * (1 + MAX_OVERLAP))
         beside[list(kept)] = False
         if beside.any():
             best = int(np.argmax(np.where(beside, sharpness, -np.inf)))

@@ -50,15 +50,7 @@ class Lattice:
         return replace(self, resolution=2 * self.resolution)
 
     def contracted(self, keys: Tensor, rows: Tensor) -> Tensor:
-        """Places of lattice corners.
-
-        Args:
-            keys: (M, 3) block keys.
-            rows: (N,) int64 rows of those blocks.
-
-        Returns:
-            (N, 3) float32 in the contracted space.
-        """
+        """(M, 3) block keys and (N,) int64 rows of these blocks → (N, 3) float32, the corners in the contracted space."""
         slot = rows.div(VOXELS, rounding_mode="floor")
         local = rows - slot * VOXELS
         inner = torch.stack([local & 7, (local >> 3) & 7, local >> 6], 1)
@@ -85,20 +77,12 @@ class Lattice:
 
 @dataclass(frozen=True)
 class LatentVolume:
-    """Latent features at lattice corners.
-
-    Attributes:
-        lattice: where the corners are.
-        topology: blocks.
-        rows: (M · 512 + 1, C) features in (−1, 1), zero where `count` is zero and in the last row.
-        count: (M · 512,) float32: weights of the key frames (a global volume) or number of views (a local one) that told of the corner;
-            0: nothing is known.
-    """
+    """Latent features at lattice corners of M blocks."""
 
     lattice: Lattice
     topology: Topology
-    rows: Tensor
-    count: Tensor
+    rows: Tensor  # (M · 512 + 1, C) in (−1, 1), zero where `count` is zero and in the last row
+    count: Tensor  # (M · 512,) weights of key frames (a global volume) or number of views (a local one) that saw the corner; 0: not known
 
     @property
     def known(self) -> Tensor:
@@ -112,18 +96,12 @@ class LatentVolume:
 
 @dataclass(frozen=True)
 class LocalVolume(LatentVolume):
-    """What a few neighbouring views tell: `rows` = tanh(`raw`), `count` = views that see the corner.
-
-    Attributes:
-        weight: (M · 512,) in (0, 1] where the corner is known: how much the key frame can say of it.
-        near_surface: blocks about surfaces. The networks work on these alone; the others hold the known terms.
-        slots: (M',) int64 slots of the blocks near surfaces.
-    """
+    """The volume of a key frame and its neighbours: `rows` = tanh(`raw`), `count` = views that see the corner."""
 
     raw: Tensor  # (M · 512 + 1, C)
-    weight: Tensor
-    near_surface: Topology
-    slots: Tensor
+    weight: Tensor  # (M · 512,) in (0, 1] where the corner is known: how much the key frame counts there
+    near_surface: Topology  # blocks about surfaces: the networks work on these alone, the others hold the known terms
+    slots: Tensor  # (M',) int64 of these blocks
 
     @cached_property
     def place(self) -> Tensor:
@@ -157,7 +135,7 @@ def cells(topology: Topology, corners: Tensor, every: bool) -> Tensor:
         (M · 512,) bool: cells whose lowest corner is that row. Corners of absent blocks count as not set.
     """
     if dispatch.can_use_triton(corners, dtypes=None):
-        from fieldfuse.backends.triton import blocks as blocks
+        from fieldfuse.backends.triton import blocks
 
         return blocks.pooled(topology, corners, 0, 2, every)
     padded = torch.cat([corners, corners.new_zeros(1)])
@@ -175,16 +153,9 @@ def cells(topology: Topology, corners: Tensor, every: bool) -> Tensor:
 def part(volume: LatentVolume, topology: Topology) -> LatentVolume:
     """A copy of some blocks of a volume; where it has no such block, nothing is known."""
     slots = volume.topology.slots_of(topology)
-    if volume.topology.blocks and dispatch.can_use_triton(volume.rows):
-        from fieldfuse.backends.triton import blocks
-
-        return LatentVolume(volume.lattice, topology, *blocks.take(volume.rows, volume.count, slots.int(), topology))
-    place = (slots.clamp_min(0)[:, None] * VOXELS + torch.arange(VOXELS, device=slots.device)).view(-1)
     here = (slots >= 0).repeat_interleave(VOXELS)
-    if volume.topology.blocks == 0:
-        place = torch.zeros_like(place)
-    count = torch.cat([volume.count, volume.count.new_zeros(1)])[place] * here
-    rows = volume.rows[place] * here[:, None]
+    place = torch.where(here, rows_of(slots, 0)[:-1], volume.topology.zero_row)
+    rows, count = volume.rows[place], torch.cat([volume.count, volume.count.new_zeros(1)])[place]
     return LatentVolume(volume.lattice, topology, torch.cat([rows, rows.new_zeros((1, rows.shape[1]))]), count)
 
 

@@ -1,7 +1,8 @@
 """NeRFusion's networks in the paper's order (Zhang et al., CVPR 2022, section 3), in plain torch.
 
     views  = model.encode(images, cameras)                         # F_i = CNN(I_i) and G(d): once an image
-    local  = model.local_volume(views[:K], cameras[:K], lattice)   # V = J([mean U_i, var U_i]), U_i = [F_i(u_i), G(d_i)]: eq. 1 and 2
+    frame  = KeyFrame(views[:K], cameras[:K])                      # a key frame and its neighbours
+    local  = model.local_volume(frame, lattice)                    # V = J([mean U_i, var U_i]), U_i = [F_i(u_i), G(d_i)]: eq. 1 and 2
     state  = model.fuse(state, local)                              # H' = GRU(H, V): eq. 3; before the first, `model.start(lattice)`
     values = model.head(state)                                     # R, eq. 5: density and features, of a global or a local volume …
     model.decoder                                                  # … and colour from them
@@ -14,7 +15,6 @@ is learned kernels do the same steps faster: in `local_volume`, `fuse_part`, `su
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 
@@ -26,25 +26,30 @@ from fieldfuse.backends import dispatch
 from fieldfuse.backends.constants import INSIDE
 from fieldfuse.backends.dispatch import is_cpu
 from fieldfuse.nerfusion.aggregate import CUES, FLAGS, aggregate, agreement, evidence
-from fieldfuse.nerfusion.cameras import Cameras
-from fieldfuse.nerfusion.compiled import fits
-from fieldfuse.nerfusion.cull import depth_range, frustum
+from fieldfuse.nerfusion.cameras import Cameras, depth_range, frustum
 from fieldfuse.nerfusion.decoder import make_decoder
-from fieldfuse.nerfusion.direction import DirectionCode
-from fieldfuse.nerfusion.encoder import DEEPEST, STRIDE, ImageEncoder, Sampled, padded
+from fieldfuse.nerfusion.encoder import DEEPEST, STRIDE, DirectionCode, ImageEncoder, Sampled, padded
 from fieldfuse.nerfusion.extras import known_terms
 from fieldfuse.nerfusion.extras.matching import SIDE, patch_descriptors
-from fieldfuse.nerfusion.extras.plane_sweep import DepthDistribution, Empty, sweep_planes
-from fieldfuse.nerfusion.extras.two_lattices import surface_cells
+from fieldfuse.nerfusion.extras.plane_sweep import sweep_planes
+from fieldfuse.nerfusion.extras.two_lattices import least_thickness, surface_cells
 from fieldfuse.nerfusion.gru import FusionGRU, RunningMean, mean_gate
-from fieldfuse.nerfusion.head import FieldHead
 from fieldfuse.nerfusion.lattice import LatentVolume, Lattice, LocalVolume, empty_volume, some_blocks, without_empty_blocks
-from fieldfuse.nerfusion.prune import least_thickness
-from fieldfuse.nerfusion.pyramid import Pyramid, levelled, middles, sizes_of
 from fieldfuse.nerfusion.recorded import Recorded, addresses, worth_recording
 from fieldfuse.nerfusion.store import ValueStore
-from fieldfuse.nerfusion.unproject import COLOURED, EncodedView, KeyFrame, look_up, project, scales
-from fieldfuse.nerfusion.volume_net import LocalReconstruction
+from fieldfuse.nerfusion.unproject import (
+    COLOURED,
+    EncodedView,
+    KeyFrame,
+    Pyramid,
+    look_up,
+    project,
+    pyramid_pixels,
+    pyramid_rows,
+    pyramid_sizes,
+    scales,
+)
+from fieldfuse.nerfusion.volume_net import FieldHead, LocalReconstruction
 from fieldfuse.volume.topology import Topology
 
 CHUNK = 2**15  # voxels at a time: what the views show of them is many times larger than what is cached
@@ -112,7 +117,7 @@ class NerfusionModel(nn.Module):
         parts = (self.encoder, self.sample, self.direction)
         maps = self._recorded(work, (side, addresses(parts)), *given) if worth_recording(images) else work(*given)
         height, width = (length + -length % DEEPEST for length in images.shape[2:])
-        sizes, fine = sizes_of(height // STRIDE, width // STRIDE, LEVELS), sizes_of(height, width, COLOUR_LEVELS)
+        sizes, fine = pyramid_sizes(height // STRIDE, width // STRIDE, LEVELS), pyramid_sizes(height, width, COLOUR_LEVELS)
         return [
             EncodedView(Pyramid(feature, sizes, STRIDE), Pyramid(colour, fine, 1), descriptors)
             for feature, colour, descriptors in zip(*maps, strict=True)
@@ -122,9 +127,9 @@ class NerfusionModel(nn.Module):
         """Rows of `encode`'s pyramids, (V, R, C) features and codes and (V, R', 3) colours, and (V, 21, h, w) for the plane sweep."""
         cameras = Cameras(intrinsics, size, poses)
         maps = self.sample(*self.encoder.maps(images)).float()  # variances are computed of them
-        features, colours = levelled(maps, LEVELS), levelled(padded((images - 0.5) * COLOUR_GAIN), COLOUR_LEVELS)
+        features, colours = pyramid_rows(maps, LEVELS), pyramid_rows(padded((images - 0.5) * COLOUR_GAIN), COLOUR_LEVELS)
         if self.direction is not None:
-            pixels = middles(sizes_of(maps.shape[2], maps.shape[3], LEVELS), STRIDE, features.device, features.dtype)
+            pixels = pyramid_pixels(pyramid_sizes(maps.shape[2], maps.shape[3], LEVELS), STRIDE, features.device, features.dtype)
             codes = self.direction(torch.stack([cameras.directions(index, pixels) for index in range(len(images))]))
             features = torch.cat([features, codes.to(features.dtype)], 2)
         descriptors = images.new_zeros((len(images), 0, 0, 0)) if side is None else patch_descriptors(images, side)
@@ -133,40 +138,32 @@ class NerfusionModel(nn.Module):
     # Unproject, mean and variance, J ----------------------------------------------------------------------------------------------
 
     def local_volume(
-        self,
-        views: Sequence[EncodedView],
-        cameras: Cameras,
-        lattice: Lattice,
-        topology: Topology | None = None,
-        wanted: Tensor | None = None,
-        near: float = 0.0,
-        far: float = math.inf,
-        distribution: DepthDistribution | None = None,
+        self, frame: KeyFrame, lattice: Lattice, topology: Topology | None = None, wanted: Tensor | None = None
     ) -> LocalVolume:
         """V = J([mean U_i, var U_i]) of a key frame and its neighbours (section 3.1). Any number of views ≥ 1, the neighbours in any order.
 
         Args:
-            views, cameras: K of each.
             topology: blocks to work on; None: every block in the key frame's frustum.
             wanted: (M · 512,) bool, corners of these blocks to work on; None: all.
-            near, far: depths along z within which views count, working units.
-            distribution: `sweep_planes` of these views; None: made here.
 
         Returns:
             a volume of those of the blocks in which the key frame sees a corner.
         """
         if topology is None:
-            topology = frustum(lattice, cameras, near, far)
-        if distribution is None:
-            bounded = near > 0 or math.isfinite(far)
-            distribution = self.sweep_planes(views, cameras, *((near, far) if bounded else depth_range(lattice, topology, cameras)))
-        frame = KeyFrame(views, cameras, near, far, distribution)
-        if self._on_device(frame):
-            from fieldfuse.nerfusion.local_cuda import local_volume
+            topology = frustum(lattice, frame.cameras, frame.near, frame.far, self.device)
+        if frame.distribution is None:
+            bounded = frame.near > 0 or math.isfinite(frame.far)
+            limits = (frame.near, frame.far) if bounded else depth_range(lattice, topology, frame.cameras)
+            frame = replace(frame, distribution=sweep_planes([view.descriptors for view in frame.views], frame.cameras, *limits))
+        assert frame.distribution is not None
+        wide = self.config.hidden in (16, 32) and self.config.channels > INSIDE
+        tables = [frame.distribution.table, *(view.features.rows for view in frame.views)]
+        if not torch.is_grad_enabled() and wide and dispatch.can_use_triton(*tables):
+            from fieldfuse.backends.triton import local_volume as kernels
 
-            numbers = known_terms.TRUNCATION, known_terms.HIDDEN, known_terms.BLIND, COLOUR_GAIN, COLOURED, known_terms.FREE
-            sizes = self.config.sampled, self.config.variance, self.config.channels
-            return local_volume(self.local, views, cameras, lattice, topology, wanted, near, far, distribution, numbers, sizes)
+            terms = known_terms.TRUNCATION, known_terms.HIDDEN, known_terms.BLIND, known_terms.FREE
+            numbers = kernels.Numbers(*terms, COLOUR_GAIN, COLOURED, self.config.sampled, self.config.variance, self.config.channels)
+            return LocalVolume(lattice, *kernels.local_volume(self.local, frame, lattice, topology, wanted, numbers))
         rows = torch.arange(topology.zero_row, device=topology.device) if wanted is None else wanted.nonzero().view(-1)
         chunks = rows.split(CHUNK if is_cpu(rows.device) else AT_ONCE)
         parts = [self._unproject(frame, lattice, topology, chunk) for chunk in chunks]
@@ -191,6 +188,7 @@ class NerfusionModel(nn.Module):
         contracted = lattice.contracted(topology.keys, rows)
         points, size = lattice.working(contracted)  # v
         projection = project(points, size, frame.cameras, frame.near, frame.far)  # u_i
+        assert frame.distribution is not None
         estimate = frame.distribution.look(points, known_terms.TRUNCATION * size)  # of the plane sweep (not in the paper)
         seen = projection.visible[0] & lattice.inside(contracted) & (estimate.visibility > known_terms.HIDDEN)
         kept = seen.nonzero().view(-1)
@@ -204,25 +202,6 @@ class NerfusionModel(nn.Module):
         colour = (mean[:, -COLOURS:] / COLOUR_GAIN + 0.5).clamp(0, 1)
         start = known_terms.start(colour, estimate.expected_sdf)
         return rows, projected, start, count.to(torch.float32), known_terms.weight(estimate)
-
-    def _on_device(self, frame: KeyFrame) -> bool:
-        """Whether kernels on CUDA make local volumes."""
-        wide = self.config.hidden in (16, 32) and self.config.channels > INSIDE
-        tables = [frame.distribution.table, *(view.features.rows for view in frame.views)]
-        return not torch.is_grad_enabled() and wide and dispatch.can_use_triton(*tables)
-
-    def sweep_planes(
-        self,
-        views: Sequence[EncodedView],
-        cameras: Cameras,
-        near: float,
-        far: float,
-        depth: Tensor | None = None,
-        empty: Empty | None = None,
-    ) -> DepthDistribution:
-        """Where along the pixels of the key frame (first) the surface is likely to be, its measured `depth` (H, W) and what is known to be
-        `empty` included; once for all lattices. Not differentiable, and not in the paper."""
-        return sweep_planes([view.descriptors for view in views], cameras, near, far, depth, empty)
 
     # Fuse -------------------------------------------------------------------------------------------------------------------------
 
@@ -241,19 +220,18 @@ class NerfusionModel(nn.Module):
 
     def fuse_part(self, part: LatentVolume, local: LocalVolume) -> LatentVolume:
         """One step of the recurrence on the blocks of a local volume alone: `part` is the global volume there."""
-        known = part.rows, part.count, local.rows, local.raw
-        if isinstance(self.fusion, FusionGRU) and not torch.is_grad_enabled() and (fits(*known) or dispatch.can_use_triton(*known)):
-            rows, count = self.fusion.compiled(part, local)
-            return replace(part, rows=rows, count=count)
-        inside = local.known
-        count = part.count * inside
-        mask = torch.cat([count > 0, inside.new_zeros(1)])[:, None]
-        before = part.rows * mask
-        z = mean_gate(count, local.weight)
-        rows = torch.lerp(before, local.rows, z)
-        near_surface, place, inner = local.near_surface, local.place, local.place[:-1]
-        given = before[place], count[inner], local.rows[place], local.raw[place], local.weight[inner]
-        after = self.fusion(*given, near_surface, inside[inner])
+        if isinstance(self.fusion, FusionGRU) and not torch.is_grad_enabled():
+            known = part.rows, part.count, local.rows, local.raw
+            if dispatch.can_use_numba(*known) or dispatch.can_use_triton(*known):
+                rows, count = self.fusion.compiled(part, local)
+                return replace(part, rows=rows, count=count)
+        count = part.count * local.known
+        before = part.rows * F.pad(count > 0, (0, 1))[:, None]
+        rows = torch.lerp(before, local.rows, mean_gate(count, local.weight))
+        place, inner = local.place, local.place[:-1]
+        near = local.near_surface, local.rows[place], local.count[inner], local.raw[place], local.weight[inner], local.near_surface
+        state = LatentVolume(local.lattice, local.near_surface, before[place], count[inner])
+        after = self.fusion(state, LocalVolume(local.lattice, *near, local.slots))
         return replace(part, rows=rows.index_copy(0, place, after), count=count + local.weight)
 
     # R ----------------------------------------------------------------------------------------------------------------------------

@@ -10,8 +10,8 @@ from torch import Tensor, nn
 
 from fieldfuse.backends.dispatch import OTHERS_GO_ON
 
-MOST = 4  # recordings that are kept
-RECORDED = 2**23  # numbers in images up to which encoding them is recorded on CUDA: recordings keep the memory that they need
+MOST = 4  # recordings that are cached
+RECORDED = 2**23  # numbers in images up to which encoding them is recorded on CUDA: recordings hold the memory that they need
 Work = Callable[..., tuple[Tensor, ...]]
 Recording = tuple[torch.cuda.CUDAGraph, list[Tensor], tuple[Tensor, ...]]  # with where it reads and what it writes
 
@@ -35,14 +35,7 @@ class Recorded:
         return Recorded, ()
 
     def __call__(self, work: Work, what: Hashable, *given: Tensor) -> tuple[Tensor, ...]:
-        """`work` of the tensors `given`.
-
-        Args:
-            what: says, with the tensors' shapes, which work it is.
-
-        Returns:
-            copies of what it gives.
-        """
+        """Copies of what `work` gives for the tensors; `what` names the work together with their shapes."""
         key = what, *[(value.shape, value.dtype) for value in given]
         if key in self._refused:
             return work(*given)

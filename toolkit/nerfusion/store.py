@@ -9,7 +9,6 @@ import torch
 from torch import Tensor
 
 from fieldfuse.backends import dispatch
-from fieldfuse.backends.dispatch import is_cpu, to_device_async
 from fieldfuse.camera import Array
 from fieldfuse.nerfusion.extras.two_lattices import adopt
 from fieldfuse.nerfusion.lattice import LatentVolume, Lattice, part, rows_of, with_blocks
@@ -20,23 +19,27 @@ NONE = np.iinfo(np.int64).min  # no block's code
 GROWTH = 1.5  # a buffer that must grow gets at least this much more room
 
 
-class _Slots:
-    """Slots by the code of a block's key, in the processor's memory."""
+class BlockSlots:
+    """Slots by block key, in the processor's memory, so that the device is not waited for."""
 
-    def __init__(self) -> None:
+    def __init__(self, keys: Array) -> None:
         self._codes, self._slots = np.zeros(0, np.int64), np.zeros(0, np.int32)  # by code
+        self.keys = np.zeros((0, 3), np.int32)
+        self.find(keys)
 
-    def find(self, codes: Array) -> tuple[Array, Array]:
-        """(M,) int64 → (M,) int32 slots, −1 where missing, and the places of those that are."""
+    def find(self, keys: Array) -> Array:
+        """(M, 3) keys → (M,) int32 slots; those that are missing get the next ones."""
+        codes = keys.astype(np.int64) @ CODE
         place = np.searchsorted(self._codes, codes)
-        here = np.append(self._codes, NONE)[place] == codes
-        return np.where(here, np.append(self._slots, -1)[place], np.int32(-1)), np.flatnonzero(~here)
-
-    def add(self, codes: Array, slots: Array) -> None:
-        """Some that are missing."""
-        order = np.argsort(codes)
-        place = np.searchsorted(self._codes, codes[order])
-        self._codes, self._slots = np.insert(self._codes, place, codes[order]), np.insert(self._slots, place, slots[order])
+        slots = np.append(self._slots, -1)[place]
+        missing = np.flatnonzero(np.append(self._codes, NONE)[place] != codes)
+        if len(missing):
+            slots[missing] = len(self.keys) + np.arange(len(missing), dtype=np.int32)
+            order = missing[np.argsort(codes[missing])]
+            place = np.searchsorted(self._codes, codes[order])
+            self._codes, self._slots = np.insert(self._codes, place, codes[order]), np.insert(self._slots, place, slots[order])
+            self.keys = np.concatenate([self.keys, keys[missing].astype(np.int32)])
+        return slots
 
 
 class GlobalStore:
@@ -44,106 +47,79 @@ class GlobalStore:
 
     def __init__(self, lattice: Lattice, channels: int, device: torch.device | str = "cpu") -> None:
         self.lattice = lattice
-        self._topology: Topology | None = Topology(torch.zeros((0, 3), dtype=torch.int32, device=device), bounds=lattice.bounds(device))
-        self._keys = np.zeros((0, 3), np.int32)  # of the next topology, where there is none
+        self._slots = BlockSlots(np.zeros((0, 3), np.int32))
+        self._topology: Topology | None = None
         self._rows = torch.zeros((VOXELS + 1, channels), device=device)
         self._count = torch.zeros(VOXELS, device=device)
-        self._known = _Slots()  # on CUDA …
-        self._asked: tuple[Topology, Tensor] | None = None  # … where these are those of the blocks that were last asked for
+        self._last: tuple[Topology, Tensor] | None = None  # the blocks of the part that was last given out, and their slots
 
     @property
     def topology(self) -> Topology:
-        """The blocks; on CUDA brought there when they are asked for."""
+        """The blocks, brought to the device on demand."""
         if self._topology is None:
-            bounds, device = self.lattice.bounds(self._rows.device), self._rows.device
-            self._topology = Topology(to_device_async(self._keys, device), bounds=bounds, host=self._keys)
+            keys, device = self._slots.keys, self._rows.device
+            self._topology = Topology(dispatch.to_device_async(keys, device), bounds=self.lattice.bounds(device), host=keys)
         return self._topology
 
     @property
     def blocks(self) -> int:
         """How many there are."""
-        return len(self._keys) if self._topology is None else self._topology.blocks
-
-    @property
-    def bytes(self) -> int:
-        """Memory held."""
-        return self._rows.numel() * 4 + self._count.numel() * 4
+        return len(self._slots.keys)
 
     def volume(self) -> LatentVolume:
         """Everything, sharing memory with the store: valid until the next change."""
-        return LatentVolume(self.lattice, self.topology, self._rows[: self.topology.zero_row + 1], self._count[: self.topology.zero_row])
+        zero_row = self.blocks * VOXELS
+        return LatentVolume(self.lattice, self.topology, self._rows[: zero_row + 1], self._count[:zero_row])
 
     def part(self, topology: Topology, inherited: LatentVolume | None = None) -> LatentVolume:
         """A copy of some blocks, to be written next; corners of which nothing is known here are as `inherited`, a volume that has at least
         these blocks."""
+        slots = self._places(topology)
         if dispatch.can_use_triton(self._rows):
-            from fieldfuse.backends.triton import blocks as blocks
+            from fieldfuse.backends.triton import blocks
 
-            slots = self._places(topology)  # may grow
             below = None if inherited is None else (inherited.rows, inherited.count, inherited.topology)
             return LatentVolume(self.lattice, topology, *blocks.take(self._rows, self._count, slots, topology, below))
-        here = part(self.volume(), topology)
+        place = rows_of(slots, 0)[:-1]
+        rows = torch.cat([self._rows[place], self._rows.new_zeros((1, self._rows.shape[1]))])
+        here = LatentVolume(self.lattice, topology, rows, self._count[place])
         return here if inherited is None else adopt(here, part(inherited, topology))
 
     def write(self, values: LatentVolume, changed: Tensor) -> None:
         """Take over the corners `changed` (M · 512,) of some blocks."""
+        slots = self._places(values.topology)
         if dispatch.can_use_triton(self._rows, values.rows):
-            from fieldfuse.backends.triton import blocks as blocks
+            from fieldfuse.backends.triton import blocks
 
-            slots = self._places(values.topology)
             blocks.put(self._rows, self._count, slots, values.rows, values.count, changed)
             return
-        slots = self._slots(values.topology)
-        place = (slots[:, None] * VOXELS + torch.arange(VOXELS, device=slots.device)).view(-1)
-        if is_cpu(place.device):
-            which = changed.nonzero().view(-1)
-            place = place[which]
-            self._rows[place] = values.rows[which]
-            self._count[place] = values.count[which]
-        else:  # what has not changed is written as it is: to choose the others would be to wait for the device
-            self._rows[place] = torch.where(changed[:, None], values.rows[:-1], self._rows[place])
-            self._count[place] = torch.where(changed, values.count, self._count[place])
+        which = changed.nonzero().view(-1)
+        place = rows_of(slots, 0)[which]
+        self._rows[place] = values.rows[which]
+        self._count[place] = values.count[which]
 
     def keep(self, blocks: Tensor) -> None:
         """Forget all blocks but those of the mask (M,)."""
-        kept = blocks.nonzero().view(-1)
-        place = (kept[:, None] * VOXELS + torch.arange(VOXELS, device=kept.device)).view(-1)
+        place = rows_of(blocks.nonzero().view(-1), 0)[:-1]
         rows, count = self._rows[place], self._count[place]
-        self._rows[: self.topology.zero_row] = 0
-        self._count[: self.topology.zero_row] = 0
+        self._rows[: self.blocks * VOXELS] = 0
+        self._count[: self.blocks * VOXELS] = 0
         self._rows[: len(rows)], self._count[: len(count)] = rows, count
-        self._topology = self.topology.alike(self.topology.keys[kept])
-        self._asked = None
-        if dispatch.can_use_triton(self._rows):
-            self._keys, self._known = self._topology.host, _Slots()
-            self._known.add(self._keys.astype(np.int64) @ CODE, np.arange(len(self._keys), dtype=np.int32))
+        self._slots = BlockSlots(self._slots.keys[blocks.cpu().numpy()])
+        self._topology = self._last = None
 
     def _places(self, topology: Topology) -> Tensor:
-        """(M,) int32 slots of blocks on CUDA, made where missing: the processor knows the keys, and does not ask the device."""
-        if self._asked is None or self._asked[0] is not topology:
-            codes = topology.host.astype(np.int64) @ CODE
-            slots, missing = self._known.find(codes)
-            if len(missing):
-                slots[missing] = self.blocks + np.arange(len(missing), dtype=np.int32)
-                self._known.add(codes[missing], slots[missing])
-                self._keys, self._topology = np.concatenate([self._keys, topology.host[missing]]), None
+        """(M,) int32 slots of blocks, made where missing."""
+        if self._last is None or self._last[0] is not topology:
+            before = self.blocks
+            slots = self._slots.find(topology.host)
+            if self.blocks > before:
+                self._topology = None
                 self._grow()
-            self._asked = topology, to_device_async(slots, self._rows.device)
-        return self._asked[1]
-
-    def _slots(self, topology: Topology) -> Tensor:
-        """(M,) slots of blocks, made where missing."""
-        slots = self.topology.slots_of(topology)
-        missing = (slots < 0).nonzero().view(-1)
-        if len(missing) == 0:
-            return slots
-        fresh, before = topology.keys[missing], self.topology.blocks
-        self._topology = self.topology.alike(torch.cat([self.topology.keys, fresh.to(torch.int32)]))
-        self._grow()
-        return slots.index_copy(0, missing, before + torch.arange(len(missing), device=slots.device))
+            self._last = topology, dispatch.to_device_async(slots, self._rows.device)
+        return self._last[1]
 
     def _grow(self) -> None:
-        """Room for all blocks."""
         needed = self.blocks * VOXELS
         if needed > len(self._count):
             room = max(needed, int(GROWTH * len(self._count) / VOXELS) * VOXELS)

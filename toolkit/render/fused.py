@@ -6,9 +6,9 @@ import math
 
 import torch
 
+from fieldfuse.nerfusion.extras.two_lattices import solid_cells
 from fieldfuse.nerfusion.lattice import LatentVolume
 from fieldfuse.nerfusion.model import NerfusionModel
-from fieldfuse.nerfusion.prune import solid_cells
 from fieldfuse.render.composite import UNITS
 from fieldfuse.render.field import Field
 from fieldfuse.volume.edit import erase_empty_blocks

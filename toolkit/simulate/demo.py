@@ -18,9 +18,8 @@ from fieldfuse.errors import OutputError
 from fieldfuse.files import atomic_path
 from fieldfuse.progress import SILENT, Progress
 from fieldfuse.simulate import textures
-from fieldfuse.simulate.cast import FAR, cast
 from fieldfuse.simulate.film import drawing
-from fieldfuse.simulate.solids import BALL, BOX, Solid, Solids, upright
+from fieldfuse.simulate.solids import BALL, BOX, FAR, Solid, Solids, upright
 
 Tensor = torch.Tensor
 
@@ -82,14 +81,14 @@ class BakedScene:
         """(H, W, 3) uint8 sRGB; every pixel is the mean of samples × samples rays. Black where no solid is."""
         fine = intrinsics.scaled(intrinsics.width * samples, intrinsics.height * samples)
         origins, directions, _ = rays(fine, world_from_camera, pixel_grid(fine.width, fine.height))
-        linear = self._colour(origins[:1], directions, *cast(self.solids, origins[:1], directions))
+        linear = self._colour(origins[:1], directions, *self.solids.cast(origins[:1], directions))
         mean = linear.reshape(intrinsics.height, samples, intrinsics.width, samples, 3).mean(dim=(1, 3))
         return (mean.clamp(0, 1) ** (1 / GAMMA) * 255).round().to(torch.uint8).numpy()
 
     def depth(self, intrinsics: Intrinsics, world_from_camera: Array) -> Array:
         """(H, W) float32 depth along z at pixel centres; 0 where no solid is."""
         origins, directions, cosine = rays(intrinsics, world_from_camera, pixel_grid(intrinsics.width, intrinsics.height))
-        distance, _ = cast(self.solids, origins[:1], directions)
+        distance, _ = self.solids.cast(origins[:1], directions)
         depth = torch.where(distance < FAR, distance * cosine, 0.0)
         return depth.reshape(intrinsics.height, intrinsics.width).numpy()
 
@@ -143,12 +142,12 @@ class BakedScene:
             towards = to_lamp / distance[:, None]
             facing = (towards * up).sum(1).clamp(min=0)
             lit = (facing > 0).nonzero()[:, 0]
-            clear = cast(self.solids, at[lit], towards[lit])[0] >= float(distance.min()) * 0.999
+            clear = self.solids.cast(at[lit], towards[lit])[0] >= float(distance.min()) * 0.999
             lamp[lit] += facing[lit] * clear / self.light.samples
         for offset in _sphere(generator, self.light.sky_samples):
             # Normal plus a point on the unit sphere: directions with a density of the cosine, as in the irradiance.
             towards = torch.nn.functional.normalize(up + torch.tensor(offset, dtype=torch.float32), dim=1)
-            sky += (cast(self.solids, at, towards)[0] >= 1.2) / self.light.sky_samples
+            sky += (self.solids.cast(at, towards)[0] >= 1.2) / self.light.sky_samples
         light = (self.light.lamp_strength * lamp + self.light.sky_strength * sky).reshape(1, 1, rows, columns)
         smooth = torch.nn.functional.avg_pool2d(torch.nn.functional.pad(light, (1, 1, 1, 1), mode="replicate"), 3, stride=1)
         return torch.nn.functional.interpolate(smooth, size=(height, width), mode="bilinear")[0, 0].numpy()
@@ -258,15 +257,15 @@ def write_demo_video(
     width, height = size
     intrinsics = Intrinsics(width, height, 0.85 * width, 0.85 * width, width / 2, height / 2)
     poses = hand_held(frames, seed)
-    with drawing() as side_by_side, atomic_path(path) as temporary:
-        scene = demo_scene(seed)
+    scene = demo_scene(seed)
+    with atomic_path(path) as temporary, drawing(lambda pose: scene.picture(intrinsics, pose), poses) as images:
         writer = cv2.VideoWriter(str(temporary), cv2.VideoWriter.fourcc(*"mp4v"), FRAMES_A_SECOND, (width, height))
         if not writer.isOpened():
             raise OutputError(f"cannot write {path}: OpenCV has no mp4 encoder or the folder is not writable; see `fieldfuse doctor`")
         try:
-            for number, picture in enumerate(side_by_side(lambda pose: scene.picture(intrinsics, pose), poses)):
+            for number, image in enumerate(images):
                 progress.check()
-                writer.write(cv2.cvtColor(picture, cv2.COLOR_RGB2BGR))
+                writer.write(cv2.cvtColor(image, cv2.COLOR_RGB2BGR))
                 progress.update(number + 1, frames)
         finally:
             writer.release()

@@ -13,10 +13,9 @@ import numpy as np
 import torch
 
 from fieldfuse.camera import Array, Intrinsics, pixel_grid
-from fieldfuse.effects.models import Distortion
+from fieldfuse.effects.models import Distortion, encode_srgb
 from fieldfuse.effects.scenery import Background, Highlights
-from fieldfuse.simulate.cast import FAR
-from fieldfuse.simulate.solids import Mesh
+from fieldfuse.simulate.solids import FAR, Mesh
 
 Tensor = torch.Tensor
 
@@ -92,6 +91,11 @@ class Picture:
     normals: Tensor  # (H, W, 3) unit, world axes; 0 where nothing is hit
     albedo: Tensor  # (H, W, 3) linear reflectance; 0 where nothing is hit
     gloss: Tensor  # (H, W)
+
+    @property
+    def rgb(self) -> Tensor:
+        """(H, W, 3) float32 sRGB in [0, 1]."""
+        return encode_srgb(self.linear)
 
 
 @lru_cache(maxsize=4)

@@ -7,10 +7,8 @@ vignetting → exposure → sensor noise → clipping, sRGB and 8 bits → compr
 from __future__ import annotations
 
 import os
-from collections import deque
 from collections.abc import Callable, Iterable, Iterator
-from concurrent.futures import Future, ThreadPoolExecutor
-from contextlib import contextmanager
+from contextlib import closing, contextmanager
 from copy import copy
 from dataclasses import dataclass, field
 from typing import Any, TypeVar
@@ -22,15 +20,16 @@ from fieldfuse.camera import Array, Intrinsics, invert
 from fieldfuse.effects.effect_specs import Effects, generator
 from fieldfuse.effects.models import encode_srgb, to_bytes
 from fieldfuse.effects.scenery import Walk
-from fieldfuse.simulate.eye import Eye, Picture, Scenery, eye_of, take
+from fieldfuse.simulate.eye import Picture, Scenery, eye_of, take
 from fieldfuse.simulate.paths import Motion
 from fieldfuse.simulate.people import peopled
 from fieldfuse.simulate.scene import Scene
+from fieldfuse.threads import in_order
 from fieldfuse.tone import share, square_radius
 
 Tensor = torch.Tensor
-Item = TypeVar("Item")
-Result = TypeVar("Result")
+T = TypeVar("T")
+R = TypeVar("R")
 
 FLOOR = 0.0  # metres: of procedural scenes
 PASSED = 1e-3  # metres before what stands still
@@ -79,7 +78,7 @@ class Film:
         self.world_from_camera = motion.poses(self.times)
         intrinsics = camera.intrinsics
         self.intrinsics = intrinsics if effects.distortion is None else effects.distortion.before(intrinsics)
-        self.eye = eye_of(self.intrinsics, camera.side, scene.device)
+        self.eye, self._plain = (eye_of(self.intrinsics, side, scene.device) for side in (camera.side, 1))
         self._falloff: Tensor | None = None
         if effects.vignetting is not None:
             falloff = share(effects.vignetting.corner, square_radius(self.intrinsics)).astype(np.float32)
@@ -104,16 +103,16 @@ class Film:
         linear = self._gathered(seconds, facts) if picture is None else picture.linear
         rgb, jpeg = self._developed(linear, index, facts)
         alone = there is self.scene
-        still = picture if picture is not None and alone else take(self.scene, plain(self.eye), pose[None])
+        still = picture if picture is not None and alone else take(self.scene, self._plain, pose[None])
         depth, normals = still.depth.cpu().numpy(), still.normals.cpu().numpy()
         passed = None if effects.passers is None else np.zeros(depth.shape, bool)
         if not alone:
-            still = take(there, plain(self.eye), pose[None])
+            still = take(there, self._plain, pose[None])
             seen = still.depth.cpu().numpy()
             passed = (seen > 0) & ((depth == 0) | (seen < depth - PASSED))
             facts["passers"] = {"share": float(passed.mean())}
         if effects.depth_offset is not None and self.has_depth:
-            still = take(there, plain(self.eye), (pose @ invert(effects.depth_offset.forward()))[None])
+            still = take(there, self._plain, (pose @ invert(effects.depth_offset.forward()))[None])
         return Shot(
             index=index,
             seconds=seconds,
@@ -179,35 +178,17 @@ class Film:
         return self.effects.depth_noise.forward(depth, albedo, gloss, generator(self.seed, "depth_noise", index))
 
 
-def plain(eye: Eye) -> Eye:
-    """The same camera with one ray a pixel."""
-    return eye_of(eye.intrinsics, 1, eye.directions.device)
-
-
 @contextmanager
-def drawing(workers: int | None = None) -> Iterator[Callable[[Callable[[Item], Result], Iterable[Item]], Iterator[Result]]]:
-    """A `map` whose calls run on worker threads, each with one torch thread: threads that wait for each other are far slower. Results come
-    in order, and no more are in flight than workers need.
+def drawing(work: Callable[[T], R], items: Iterable[T], workers: int | None = None) -> Iterator[Iterator[R]]:
+    """`work` of each item, in order, on worker threads with one torch thread each: threads that wait for each other are far slower.
 
     Args:
         workers: None: one a core, at most 4.
     """
     before = torch.get_num_threads()
     torch.set_num_threads(1)
-    count = workers or min(os.cpu_count() or 1, 4)
-    pool = ThreadPoolExecutor(count)
-
-    def in_order(work: Callable[[Item], Result], items: Iterable[Item]) -> Iterator[Result]:
-        waiting: deque[Future[Result]] = deque()
-        for item in items:
-            waiting.append(pool.submit(work, item))
-            if len(waiting) > count:
-                yield waiting.popleft().result()
-        while waiting:
-            yield waiting.popleft().result()
-
     try:
-        yield in_order
+        with closing(in_order(work, items, workers or min(os.cpu_count() or 1, 4))) as results:
+            yield results
     finally:
-        pool.shutdown(cancel_futures=True)
         torch.set_num_threads(before)

@@ -14,10 +14,9 @@ from fieldfuse.camera import Array
 from fieldfuse.effects.models import decode_srgb
 from fieldfuse.effects.scenery import Background, Highlights
 from fieldfuse.errors import InputError
-from fieldfuse.simulate.cast import FAR
 from fieldfuse.simulate.eye import Rays, Seen
 from fieldfuse.simulate.materials import Atlas
-from fieldfuse.simulate.solids import Mesh
+from fieldfuse.simulate.solids import FAR, Mesh
 from fieldfuse.tone import shares
 
 Tensor = torch.Tensor

@@ -7,10 +7,8 @@ from dataclasses import dataclass, replace
 import torch
 
 from fieldfuse.camera import Array, Intrinsics
-from fieldfuse.effects.models import encode_srgb
 from fieldfuse.effects.scenery import Background, Highlights
-from fieldfuse.simulate.cast import cast
-from fieldfuse.simulate.eye import Rays, Seen, eye_of, take
+from fieldfuse.simulate.eye import Picture, Rays, Seen, eye_of, take
 from fieldfuse.simulate.materials import Materials, TextureBank
 from fieldfuse.simulate.solids import ROOM, Mesh, Solids, tessellate
 
@@ -27,15 +25,6 @@ class Lamp:
     position: tuple[float, float, float]
     colour: tuple[float, float, float]  # linear irradiance on a surface that faces it, at `reach`
     reach: float | None = 2.0  # metres; None: as strong everywhere (the sun; put it far away)
-
-
-@dataclass(frozen=True)
-class Rendered:
-    """One image with its truth."""
-
-    rgb: Tensor  # (H, W, 3) float32 sRGB in [0, 1]
-    depth: Tensor  # (H, W) float32 metres along z at pixel centres, 0 where nothing is hit
-    normals: Tensor  # (H, W, 3) float32 unit, world axes, towards the camera; 0 where nothing is hit
 
 
 @dataclass
@@ -78,20 +67,19 @@ class Scene:
         """All solids as triangles, also the parts that lie hidden inside or below others."""
         return tessellate(self.solids.items)
 
-    def render(self, intrinsics: Intrinsics, world_from_camera: Array, side: int = EDGE_SIDE) -> Rendered:
+    def render(self, intrinsics: Intrinsics, world_from_camera: Array, side: int = EDGE_SIDE) -> Picture:
         """A camera's image, depth and normals, through its lens.
 
         Args:
             world_from_camera: (4, 4).
             side: pixels that hold an edge are the mean of side × side rays; 1: one ray a pixel everywhere.
         """
-        picture = take(self, eye_of(intrinsics, side, self.device), world_from_camera[None])
-        return Rendered(encode_srgb(picture.linear), picture.depth, picture.normals)
+        return take(self, eye_of(intrinsics, side, self.device), world_from_camera[None])
 
     def see(self, beam: Rays) -> Seen:
         """What rays see: light, distance, normals and material, one row a ray."""
         origins, directions = beam.origins, beam.directions
-        distance, solid = cast(self.solids, origins, directions)
+        distance, solid = self.solids.cast(origins, directions)
         hit = (solid >= 0).nonzero()[:, 0]
         every = len(hit) == len(solid)
 
@@ -151,7 +139,7 @@ class Scene:
             light = light * (2 * lamp.reach**2 / (lamp.reach**2 + distance.square()))
         lit = (facing > 0).nonzero()[:, 0]
         # From the lamp to the points: all rays start at one place, and neighbours stay neighbours.
-        reached, _ = cast(self.solids, position, -to_lamp[lit])
+        reached, _ = self.solids.cast(position, -to_lamp[lit])
         blocked = reached < distance[lit] * (1 - 1e-3) - 2e-3
         shadow = torch.zeros(len(points), dtype=torch.int64, device=self.device)
         shadow[lit] = blocked.long()

@@ -95,9 +95,9 @@ def simulate(
     with (
         atomic_path(out) as temporary,
         closing(CaptureWriter(temporary, film.intrinsics, settings.path.fps, settings.output, suffix)) as writer,
-        drawing(workers) as side_by_side,
+        drawing(film.shot, range(len(film)), workers) as shots,
     ):
-        for done, shot in enumerate(side_by_side(film.shot, range(len(film)))):
+        for done, shot in enumerate(shots):
             progress.check()
             writer.add(shot)
             progress.update(done + 1, len(film))

@@ -11,12 +11,17 @@ import numpy as np
 import torch
 from numpy.typing import ArrayLike
 
+from fieldfuse.backends import dispatch
+from fieldfuse.backends.numba import cast as compiled
 from fieldfuse.camera import Array
+from fieldfuse.threads import share, slices
 
 Tensor = torch.Tensor
 
 BOX, ROOM, BALL, CYLINDER = "box", "room", "ball", "cylinder"
 KINDS = (BOX, ROOM, BALL, CYLINDER)
+FAR = float(compiled.FAR)
+FEW = 4096  # rays below which threads do not pay
 THINNEST = 5e-4  # metres: half sizes below this lose the face that was hit in float32
 ROUND = 48  # corners of a circle in triangles: its flat sides lie within 0.2% of the radius
 
@@ -76,10 +81,11 @@ class Solids:
         ends = np.cumsum([sum(solid.kind == kind for solid in self.items) for kind in KINDS]).tolist()
         self.ranges = dict(zip(KINDS, pairwise([0, *ends]), strict=True))  # kind → first and past-the-last number
         half = np.array([np.maximum(solid.half, THINNEST) for solid in self.items]).reshape(-1, 3)
-        # Of a sphere around each: a ball's is its largest half size, and a room is met by every ray.
+        # Of a sphere around each, a little more: a ball's is its largest half size, and a room is met by every ray.
         balls, rooms = slice(*self.ranges[BALL]), slice(*self.ranges[ROOM])
-        radius = 1.001 * np.linalg.norm(half, axis=1)
-        radius[balls], radius[rooms] = 1.001 * half[balls].max(axis=1, initial=0), np.inf
+        radius = np.linalg.norm(half, axis=1)
+        radius[balls], radius[rooms] = half[balls].max(axis=1, initial=0), np.inf
+        radius = 1.001 * radius + 1e-4
 
         def stack(rows: object, *shape: int) -> Tensor:
             return torch.tensor(np.array(rows, dtype=np.float32).reshape(-1, *shape), device=device)
@@ -95,6 +101,33 @@ class Solids:
 
     def to(self, device: torch.device | str) -> Solids:
         return Solids(self.items, device)
+
+    def cast(self, origins: Tensor, directions: Tensor) -> tuple[Tensor, Tensor]:
+        """First hits of rays, exact: compiled on CPUs, by Triton on CUDA.
+
+        Args:
+            origins: (N, 3), or (1, 3) for rays from one place.
+            directions: (N, 3) unit vectors.
+
+        Returns:
+            distance (N,), `FAR` where nothing is hit, and the number of the solid (N,) int64, −1 where nothing is hit. A solid that
+            the ray starts in is not seen (rooms are seen from inside).
+        """
+        if dispatch.can_use_triton(origins, directions):
+            from fieldfuse.backends.triton import cast as cast_gpu
+
+            return cast_gpu.cast(self, origins, directions, FAR, float(compiled.NEAREST))
+        starts, rays = (values.contiguous().cpu().numpy() for values in (origins, directions))
+        distance, number = torch.empty(len(rays)), torch.empty(len(rays), dtype=torch.int64)
+        shapes = [values.cpu().numpy() for values in (self.centre, self.half, self.rotation, self.radius, self.ends)]
+
+        def part(some: slice) -> None:
+            own = starts if len(starts) == 1 else starts[some]
+            compiled.cast(own, rays[some], *shapes, distance[some].numpy(), number[some].numpy())
+
+        threads = torch.get_num_threads() if len(rays) > FEW else 1
+        share(part, slices(len(rays), 4 * threads if threads > 1 else 1), threads)
+        return distance.to(directions.device), number.to(directions.device)
 
     def surface(self, numbers: Tensor, points: Tensor) -> tuple[Tensor, Tensor, Tensor]:
         """Where points on the surface of solids lie, in the solids' own terms.

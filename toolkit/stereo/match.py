@@ -8,7 +8,6 @@ through it afterwards (`plane_completion.py`).
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Sequence
-from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from typing import TypeVar
 
@@ -23,6 +22,7 @@ from fieldfuse.poses.overlap import best_neighbours, overlap, parallax, spread_p
 from fieldfuse.progress import SILENT, Progress
 from fieldfuse.stereo.consistency import DepthMaps, confirmed
 from fieldfuse.stereo.cost_volume import GreyView, Matcher, grey_view, plane_homography, refined, smoothed_planes
+from fieldfuse.threads import in_order
 
 T = TypeVar("T")
 
@@ -170,11 +170,7 @@ def _workers() -> int:
 
 def side_by_side(of: Callable[[int], T], count: int, workers: int | None = None) -> Iterator[T]:
     """`of` of each number below `count`, in order, several at once on threads; it has to let other threads go on."""
-    with ThreadPoolExecutor(workers or _workers()) as pool:
-        try:
-            yield from pool.map(of, range(count))
-        finally:
-            pool.shutdown(cancel_futures=True)
+    return in_order(of, range(count), workers or _workers())
 
 
 def shrunk_camera(camera: Intrinsics, long_side: int) -> Intrinsics:

@@ -18,8 +18,9 @@ from fieldfuse.capture.types import Views
 from fieldfuse.progress import SILENT, Progress
 from fieldfuse.render.color_backprojection import recoloured
 from fieldfuse.render.field import Field
-from fieldfuse.training.levels import beside, finer
+from fieldfuse.training.levels import finer
 from fieldfuse.training.silhouettes import inside_silhouettes
+from fieldfuse.volume.edit import dilate
 from fieldfuse.volume.host import TorchHost
 from fieldfuse.volume.topology import BLOCK
 
@@ -60,7 +61,7 @@ def finer_colours(field: Field, views: Views, depth: float, progress: Progress =
     own = False  # whether the field's rows were made here
     while True:
         field, seen = recoloured(field, views, depth, progress, engine, RELAXATION, in_place=own)
-        kept = beside(field.topology, (seen > SEEN) & field.occupied) & field.occupied
+        kept = dilate(field.topology, (seen > SEEN) & field.occupied, 1, grow=False)[1] & field.occupied
         resolution = _next(field, wanted, int(kept.sum()), most)
         if resolution is None:
             return recoloured(field, views, depth, progress, engine, RELAXATION, in_place=True).field

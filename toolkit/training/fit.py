@@ -123,16 +123,13 @@ class Sample:
         """(V,) decibels of each view that has pixels in the sample."""
         if self.batch is None:
             return np.zeros(0)
-        error = (self._as_taken(engine.colours(self.batch.origins, self.batch.directions)) - self.batch.colour).square().mean(-1)
+        shown = engine.colours(self.batch.origins, self.batch.directions)
+        if self.factor is not None:  # what was taken out of their images is put back
+            shown = torch.from_numpy(encode(decode(shown.detach().cpu().numpy().astype(np.float64)) * self.factor)).to(shown)
+        error = (shown - self.batch.colour).square().mean(-1)
         views, pixels = self.batch.view.unique(return_inverse=True, return_counts=True)[1:]
         of_views = torch.zeros(len(pixels), device=error.device).index_add(0, views, error) / pixels
         return np.asarray((-10 * of_views.clamp_min(1e-10).log10()).cpu().numpy())
-
-    def _as_taken(self, shown: torch.Tensor) -> torch.Tensor:
-        """(P, 3) colours of the sample's pixels with what was taken out of their images put back."""
-        if self.factor is None:
-            return shown
-        return torch.from_numpy(encode(decode(shown.detach().cpu().numpy().astype(np.float64)) * self.factor)).to(shown)
 
 
 def _factors(views: Views, view: Array, row: Array, column: Array) -> Array | None:
@@ -224,7 +221,8 @@ def fit_field(
             if voxels > MANY_VOXELS:  # memory is bounded
                 came = keep & (engine.visits > 0)
                 voxels = int(came.sum()) * growth  # what stays for the sake of holes gets no rays, so it does not decide
-                keep = keep & looked_at(current, engine.seen, engine.visits, settings.fit.prune_weight) if plan.next_is_finest else came
+                near = looked_at(current, engine.seen, engine.visits, settings.fit.prune_weight)
+                keep = keep & near if plan.level == len(ladder) - 2 else came
             if plan.worth(voxels, plan.rays_left(now, result.rays)) and memory_limits.fits(current, keep, plan, settings, policy.notes):
                 plan.climb()
                 engine.release()

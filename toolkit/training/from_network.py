@@ -9,7 +9,7 @@ from __future__ import annotations
 import math
 import time
 from collections.abc import Iterator
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -24,7 +24,6 @@ from fieldfuse.nerfusion.fusion import Fused, FusionOptions, fuse_views
 from fieldfuse.nerfusion.keyframes import KeyFrames
 from fieldfuse.nerfusion.lattice import Lattice
 from fieldfuse.nerfusion.model import NerfusionModel
-from fieldfuse.nerfusion.precision import AUTO
 from fieldfuse.nerfusion.weights import load_model
 from fieldfuse.poses.scene import Scene
 from fieldfuse.progress import SILENT, Progress
@@ -40,42 +39,11 @@ from fieldfuse.volume.topology import BLOCK
 SHIPPED = weights.SHIPPED
 # Voxels that make up the median depth at least, on the finer of two lattices. One lattice of 24 alone loses 1.5 to 2.5 dB, while 104
 # gain 0.25 dB for about three times the seconds (docs/measured/few_views.md), so none need be smaller than some pixels; a larger one shows.
-VOXELS_TO_MEDIAN, LEVELS = 48.0, 2
+VOXELS_TO_MEDIAN = 48.0
 PIXELS = 5.0  # that a voxel spans at most: colours become finer afterwards (`finer_colours.py`) …
 MEASURED_PIXELS = 3.5  # … where a sensor's depth is more exact about where surfaces are …
 OBJECT_PIXELS = 2.6  # … and where alpha cuts the object out: fewer voxels are in play
-GAMMA = 0.95  # the paper's 0.6 cuts holes where the networks are in doubt
 LEAST, MOST = 32, 384  # resolution of the lattice
-
-
-@dataclass(frozen=True)
-class NetworkOptions:
-    """Settings of direct inference.
-
-    Attributes:
-        voxels: voxels that make up the median depth, on the finest lattice; None: see `voxels_to_median`.
-        levels: lattices, each of half the voxel size of the one before; 1: the paper's single one.
-        gamma: see-through voxels (exp(−optical thickness) above it) are not rendered; None: all are.
-        measured: the views' depth goes into the key frames' sweeps.
-        agreement: key frames' sweeps are held against each other, but for captures with alpha, where the visual hull is known.
-        recolour: `Inference.result` looks colours up again in the training images (`finer_colours`).
-        precision: of the networks' arithmetic (`nerfusion.precision`).
-    """
-
-    voxels: float | None = None
-    levels: int = LEVELS
-    gamma: float | None = GAMMA
-    measured: bool = False
-    agreement: bool = True
-    recolour: bool = True
-    precision: str = AUTO
-
-    @classmethod
-    def of(cls, settings: NetworkSettings) -> NetworkOptions:
-        """Those of the settings."""
-        measured = settings.depth_from == "sensor"
-        switches = {"measured": measured, "agreement": settings.agreement, "recolour": settings.recolour}
-        return cls(settings.voxels, settings.levels, settings.gamma, **switches, precision=settings.precision)
 
 
 def load_networks(path: Path | str | None = None, device: torch.device | str = "cpu") -> NerfusionModel:
@@ -115,7 +83,7 @@ class Inference:
         scene: Scene,
         keys: KeyFrames,
         background: str = "auto",
-        options: NetworkOptions | None = None,
+        settings: NetworkSettings | None = None,
     ) -> None:
         """
         Args:
@@ -129,11 +97,12 @@ class Inference:
         train = np.flatnonzero(~np.asarray(views.test))
         if len(train) == 0 or len(keys.indices) == 0:
             raise InputError("no training view is left for the networks; lower --holdout or give more images")
-        self.model, self.keys, self.options = model, keys, options or NetworkOptions()
+        self.model, self.keys, self.settings = model, keys, settings or NetworkSettings()
+        self.measured = self.settings.depth_from == "sensor"
         self.train = views.subset(train)
         self.near, self.far, self.median_depth = scene.near, scene.far, scene.median_depth
-        voxels = self.options.voxels or voxels_to_median(self.train, self.options.measured)
-        self.lattice = lattice_of(space_of(views, scene, background), scene, voxels, self.options.levels)
+        voxels = self.settings.voxels or voxels_to_median(self.train, self.measured)
+        self.lattice = lattice_of(space_of(views, scene, background), scene, voxels, self.settings.levels)
         self.behind, self.sky = colour_behind(views).to(model.device), sky_behind(views)
         start = time.perf_counter()
         self.hull = visual_hull(self.lattice.space, self.train, model.device)
@@ -148,12 +117,12 @@ class Inference:
         Raises:
             Interrupted: the user asked to stop.
         """
-        measured, precision = self.options.measured, self.options.precision
-        options = FusionOptions(self.options.levels, self.near, self.far, measured=measured, precision=precision)
+        own = self.settings
+        options = FusionOptions(own.levels, self.near, self.far, measured=self.measured, precision=own.precision, empty=self.hull)
         # Things without texture that stand before nothing lead all sweeps astray in the same way; the hull is the better guide.
-        agree = self.options.agreement and self.hull is None and (self.near > 0 or math.isfinite(self.far))
-        witnesses = overlapping(self.keys, self.train.world_from_camera, self.train.intrinsics, self.median_depth) if agree else None
-        for fused in fuse_views(self.model, self.train, self.keys, self.lattice, options, progress, self.hull, witnesses):
+        agree = own.agreement and self.hull is None and (self.near > 0 or math.isfinite(self.far))
+        others = overlapping(self.keys, self.train.world_from_camera, self.train.intrinsics, self.median_depth) if agree else None
+        for fused in fuse_views(self.model, self.train, self.keys, self.lattice, options, progress, others):
             self._latest = fused
             self.seconds += fused.seconds
             self.fusion_seconds += fused.seconds
@@ -174,7 +143,7 @@ class Inference:
         if self._latest is None:
             raise InputError("no key frame has been fused yet, so there is no field; fuse one first")
         start = time.perf_counter()
-        gamma, allowed = self.options.gamma, self._latest.allowed
+        gamma, allowed = self.settings.gamma if self.settings.gamma < 1 else None, self._latest.allowed  # 1 prunes nothing
         made = make_field(self.model, self._latest.volume, self.behind, gamma, 0.5 * self.near, allowed=allowed)
         if finished and self.hull is not None:
             made = inside_silhouettes(made, self.train)
@@ -183,7 +152,7 @@ class Inference:
         return made
 
     def result(self, progress: Progress = SILENT, engine: str = "auto") -> Field:
-        """What direct inference gives, when no more key frame will come: the field with colours looked up again if the options have it;
+        """What direct inference gives, when no more key frame will come: the field with colours looked up again if the settings have it;
         some seconds.
 
         Raises:
@@ -192,7 +161,7 @@ class Inference:
         """
         made = self.field()
         start = time.perf_counter()
-        if self.options.recolour:
+        if self.settings.recolour:
             made = finer_colours(made, self.train, self.median_depth, progress, engine)
         self.seconds += time.perf_counter() - start
         return made

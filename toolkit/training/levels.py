@@ -102,18 +102,13 @@ def visible(field: Field, seen: Tensor, visits: Tensor, threshold: float) -> Ten
         return field.occupied
     stays = visits < ENOUGH_VISITS
     del visits
-    return stays.logical_or_(beside(field.topology, strong)).logical_and_(field.occupied)
+    return stays.logical_or_(dilate(field.topology, strong, 1, grow=False)[1]).logical_and_(field.occupied)
 
 
 def looked_at(field: Field, seen: Tensor, visits: Tensor, threshold: float) -> Tensor:
     """(M · 512,) bool: the voxels that rays came to, and those beside a surface, which would have holes where a lattice has more voxels
     than rays came. The others are the first to go when memory is short. Arguments as in `visible`."""
-    return (visits > 0) | beside(field.topology, seen > threshold)
-
-
-def beside(topology: Topology, strong: Tensor) -> Tensor:
-    """(M · 512,) bool grown by one voxel, within these blocks."""
-    return dilate(topology, strong, 1, grow=False)[1]
+    return (visits > 0) | dilate(field.topology, seen > threshold, 1, grow=False)[1]
 
 
 def pruned(field: Field, keep: Tensor) -> Field:

@@ -64,30 +64,16 @@ def network_start(made: Field, views: Views, scene: Scene, settings: Settings) -
     raw, feature, mark = resample(made.topology, made.occupied, [made.density_rows, made.feature_rows, known], topology.keys, scale)
     density = torch.where(mark > 0, raw.clamp(THIN, THICK), torch.full_like(raw, THIN))
     density[-1] = 0
-    taken = _takes_features(made, settings)
     channels, hidden = settings.field.channels, settings.field.width
     noise = (torch.randn(len(density), channels, generator=generator) * FEATURE_NOISE).to(device)
     decoder: Deferred | PerSample
-    if taken and isinstance(made.decoder, Deferred):
+    fits = settings.field.decoder == "deferred" and made.feature_rows.shape[1] == channels
+    if isinstance(made.decoder, Deferred) and fits and made.decoder.hidden <= hidden:
         decoder = widened(made.decoder, hidden, generator)
         rows = torch.where((mark > 0)[:, None], feature, noise)
     else:
         decoder = new_decoder(settings.field)
         rows = noise
     rows[-1] = 0
-    return replace(
-        made,
-        resolution=resolution,
-        topology=topology,
-        occupied=occupied,
-        density_rows=density,
-        feature_rows=rows.contiguous(),
-        decoder=decoder.to(device),
-        near=NEAR * scene.near,
-    )
-
-
-def _takes_features(made: Field, settings: Settings) -> bool:
-    """Whether the fit's decoder can take over the networks' features."""
-    same = isinstance(made.decoder, Deferred) and settings.field.decoder == "deferred"
-    return same and made.feature_rows.shape[1] == settings.field.channels and made.decoder.hidden <= settings.field.width
+    made = replace(made, resolution=resolution, topology=topology, occupied=occupied, density_rows=density, feature_rows=rows.contiguous())
+    return replace(made, decoder=decoder.to(device), near=NEAR * scene.near)

@@ -92,10 +92,6 @@ class Schedule:
     def finest(self) -> bool:
         return self.level == len(self.ladder) - 1
 
-    @property
-    def next_is_finest(self) -> bool:
-        return self.level == len(self.ladder) - 2
-
     def radius(self, done: float) -> float:
         """Deviation in pixels of the means that colours are at this level: 0 at the finest, and late in a fit that does not reach it."""
         sharp = self.finest or done > LAST_SOFT

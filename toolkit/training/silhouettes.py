@@ -7,9 +7,10 @@ from dataclasses import dataclass, replace
 import numpy as np
 import torch
 
+from fieldfuse.backends.dispatch import can_use_numba
+from fieldfuse.backends.numba.tensors import spread
 from fieldfuse.backends.numba.volume import outside_hull
 from fieldfuse.capture.types import Views
-from fieldfuse.nerfusion import compiled
 from fieldfuse.nerfusion.lattice import Lattice
 from fieldfuse.render.field import Field
 from fieldfuse.training.levels import all_places
@@ -34,10 +35,10 @@ class Hull:
     def __call__(self, points: Tensor) -> Tensor:
         """(N, 3) points of the working frame → (N,) bool, outside of the hull (or of the lattice)."""
         side = len(self.empty)
-        if compiled.fits(points) and self.empty.device.type == "cpu":
+        if can_use_numba(points) and self.empty.device.type == "cpu":
             out, given = np.empty(len(points), np.bool_), points.detach().contiguous().numpy()
             numbers = np.array([*self.space.centre, self.space.half, self.space.shell, self.space.extent], np.float32)
-            compiled.spread(lambda n: outside_hull(given[n], self.empty.numpy(), numbers, out[n]), len(points))
+            spread(lambda n: outside_hull(given[n], self.empty.numpy(), numbers, out[n]), len(points))
             return torch.from_numpy(out)
         contracted = self.space.contract(self.space.normalise(points))
         place = ((contracted + self.space.extent) * (side / (2 * self.space.extent))).floor().long()

@@ -9,7 +9,6 @@ from __future__ import annotations
 
 import itertools
 import time
-from collections.abc import Callable
 from dataclasses import replace
 
 import numpy as np
@@ -70,8 +69,8 @@ class Trial:
 
     def _score(self, views: Views) -> Array | None:
         assert self._scene is not None
-        bounded = _Bounded(self.progress)
-        result = fit_field(views, self._scene, self.settings, bounded, ticks=_ticks())
+        bounded, looks = _Bounded(self.progress), itertools.count()  # a clock that goes on with each look: `STEPS` steps on any machine
+        result = fit_field(views, self._scene, self.settings, bounded, ticks=lambda: next(looks) * BUDGET / STEPS)
         self.progress.check()
         return None if bounded.over or not result.held_out else np.array(result.held_out)
 
@@ -90,12 +89,6 @@ def short(settings: Settings) -> Settings:
         field=replace(settings.field, resolution=RESOLUTION, background="auto"),
         fit=replace(settings.fit, budget=BUDGET, depth_from="sensor", moving="off", patience=False, passes=None),
     )
-
-
-def _ticks() -> Callable[[], float]:
-    """A clock that goes on by the same time at each look, so that a fit makes `STEPS` steps on any machine."""
-    looks = itertools.count()
-    return lambda: next(looks) * BUDGET / STEPS
 
 
 class _Bounded(Progress):

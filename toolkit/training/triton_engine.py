@@ -15,10 +15,9 @@ import triton
 from fieldfuse.backends.constants import RENEW
 from fieldfuse.backends.dispatch import OTHERS_GO_ON
 from fieldfuse.backends.triton.march import BEHIND, COUNTS, JITTER, NOTES, RED, TARGET
-from fieldfuse.backends.triton.train_adam import count_step, learn, move
+from fieldfuse.backends.triton.train_adam import RATES, count_step, learn, move, rates_of
 from fieldfuse.backends.triton.train_draw import draw
 from fieldfuse.backends.triton.train_gradients import inspect, judge, spread
-from fieldfuse.backends.triton.train_rates import RATES, told
 from fieldfuse.nerfusion.decoder import Deferred
 from fieldfuse.nerfusion.encoding import DIRECTION, spherical_harmonics
 from fieldfuse.render.field import Field
@@ -161,7 +160,7 @@ class TritonEngine:
     def _stage(self, rates: Rates) -> None:
         """The step sizes, to where the kernels read them."""
         staged = self._staged[self.steps % len(self._staged)]
-        for place, value in enumerate(told(rates)):
+        for place, value in enumerate(rates_of(rates)):
             staged[place] = value
         self.threshold = rates.colour_threshold
         self.rates.copy_(staged, non_blocking=True)

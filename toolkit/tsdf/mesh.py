@@ -77,17 +77,13 @@ class Mesh:
 
     def components(self) -> Array:
         """(T,) int32: the connected component of each triangle (triangles that share an edge are connected), largest number unknown."""
-        edges, order = self._edges()
+        from_, to = self.triangles.reshape(-1).astype(np.int64), np.roll(self.triangles, -1, axis=1).reshape(-1)
+        edges = np.minimum(from_, to) * len(self.vertices) + np.maximum(from_, to)  # the same number for the same two vertices
+        order = np.argsort(edges)
         shared = np.flatnonzero(np.diff(edges[order]) == 0)
         pairs = order[shared] // 3, order[shared + 1] // 3
         graph = coo_array((np.ones(len(shared), bool), pairs), shape=(len(self.triangles),) * 2)
         return np.asarray(connected_components(graph, directed=False)[1])
-
-    def _edges(self) -> tuple[Array, Array]:
-        """(3 T,) int64 a number of each triangle's edges, the same for the same two vertices, and the order that sorts them."""
-        from_, to = self.triangles.reshape(-1).astype(np.int64), np.roll(self.triangles, -1, axis=1).reshape(-1)
-        edges = np.minimum(from_, to) * len(self.vertices) + np.maximum(from_, to)
-        return edges, np.argsort(edges)
 
     def cleaned(self, min_area_share: float = 0.0) -> Mesh:
         """Without degenerate and repeated triangles, small components, and vertices that nothing uses.
@@ -137,21 +133,16 @@ class Mesh:
         count = len(self.vertices)
         if rounds == 0 or len(self.triangles) == 0:
             return self
-        from_, to = self.triangles.reshape(-1), np.roll(self.triangles, -1, axis=1).reshape(-1)
-        edges, order = self._edges()
-        again = np.diff(edges[order]) == 0
-        alone = order[~(np.concatenate([[False], again]) | np.concatenate([again, [False]]))]  # edges of one triangle: a border
-        # An edge between two triangles is met from both, so that each neighbour counts twice; those of borders do not matter.
-        share = np.bincount(from_, minlength=count) + np.bincount(to, minlength=count)
+        sides = self.triangles.reshape(-1), np.roll(self.triangles, -1, axis=1).reshape(-1)
+        once = coo_array((np.ones(len(sides[0])), sides), shape=(count, count)).tocsr()
+        beside = once + once.T  # of two vertices: how many triangles have the edge between them
+        share = beside.sum(axis=1)
+        each = beside.tocoo()
         moves = share > 0
-        moves[from_[alone]] = moves[to[alone]] = False
+        moves[each.row[each.data == 1]] = False  # an edge of one triangle is a border
         vertices = self.vertices
         for _ in range(rounds):
-            sums = [
-                np.bincount(from_, vertices[to, axis], minlength=count) + np.bincount(to, vertices[from_, axis], minlength=count)
-                for axis in range(3)
-            ]
-            vertices = np.where(moves[:, None], np.stack(sums, axis=1) / np.maximum(share, 1)[:, None], self.vertices)
+            vertices = np.where(moves[:, None], (beside @ vertices) / np.maximum(share, 1)[:, None], self.vertices)
         normals = None if self.normals is None else replace(self, vertices=vertices, normals=None).with_normals().normals
         return replace(self, vertices=vertices, normals=normals)
 

@@ -160,15 +160,9 @@ def split(topology: Topology, occupied: Tensor, rows: Sequence[Tensor]) -> tuple
     new_topology, new_occupied = with_corner_blocks(Topology(keys, bounds=bounds), child.reshape(-1))
     out = resample(topology, occupied, rows, new_topology.keys, 0.5)
     unused = ~corner_nodes(new_topology, new_occupied)
-    return new_topology, new_occupied, [_cleared(values, unused) for values in out]
-
-
-def _cleared(values: Tensor, unused: Tensor) -> Tensor:
-    """(N + 1, …) rows, in place, zero where `unused` (N,)."""
-    if is_cpu(values.device):
-        return values.index_fill_(0, unused.nonzero().view(-1), 0.0)
-    values[:-1].masked_fill_(unused.view(-1, *[1] * (values.ndim - 1)), 0.0)
-    return values
+    for values in out:
+        values[:-1].masked_fill_(unused.view(-1, *[1] * (values.ndim - 1)), 0.0)
+    return new_topology, new_occupied, out
 
 
 def doubled(low: tuple[int, int, int], high: tuple[int, int, int]) -> Bounds:

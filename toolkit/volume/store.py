@@ -119,7 +119,8 @@ def write_field(path: Path | str, data: FieldFile, precision: str = "float32") -
     features = data.features.detach().to("cpu", kind).contiguous()
     tensors = {name: getattr(data, name).detach().cpu().contiguous() for name in ("keys", "node_index", "density")}
     tensors["features"] = features
-    tensors["occupied"] = pack_bits(data.occupied.detach().cpu())
+    occupied = data.occupied.detach().bool().cpu().view(-1, VOXELS).numpy()
+    tensors["occupied"] = torch.from_numpy(np.packbits(occupied, axis=1, bitorder="little"))
     tensors |= {f"decoder.{name}": tensor.detach().cpu().contiguous() for name, tensor in data.decoder.items()}
     information = {
         "version": data.version,
@@ -237,7 +238,8 @@ def _checked(tensors: dict[str, Tensor], text: str) -> FieldFile:
             raise _Unusable(f"its decoder tensor {name[:40]!r} has the type {tensor.dtype}")
         if not all(bool(torch.isfinite(part).all()) for part in tensor.reshape(-1).split(AT_ONCE)):
             raise _Unusable(f"its tensor {name[:40]!r} holds values that are not finite")
-    return FieldFile(keys, unpack_bits(packed), nodes, features, density, decoder, **header)
+    occupied = torch.from_numpy(np.unpackbits(packed.numpy(), axis=1, bitorder="little").astype(bool))
+    return FieldFile(keys, occupied, nodes, features, density, decoder, **header)
 
 
 def _check_keys(keys: Tensor) -> None:
@@ -277,13 +279,3 @@ def _header(text: str) -> dict[str, Any]:
         raise _Unusable("its similarity does not hold a rotation")
     working = Similarity(similarity.scale, rotation, np.array(similarity.translation, np.float64))
     return {**vars(header), "working_from_input": working}
-
-
-def pack_bits(occupied: Tensor) -> Tensor:
-    """(M, 512) bool → (M, 64) uint8, lowest bit first."""
-    return torch.from_numpy(np.packbits(occupied.bool().view(-1, VOXELS).numpy(), axis=1, bitorder="little").reshape(-1, _BITS))
-
-
-def unpack_bits(packed: Tensor) -> Tensor:
-    """(M, 64) uint8 → (M, 512) bool."""
-    return torch.from_numpy(np.unpackbits(packed.numpy(), axis=1, bitorder="little").astype(bool))

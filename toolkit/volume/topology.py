@@ -81,9 +81,9 @@ class Topology:
     @cached_property
     def _placed(self) -> tuple[Tensor, Tensor]:
         """The table and the cells of its own blocks; elsewhere than on CUDA already known."""
-        from fieldfuse.backends.triton import tables as tables_gpu
+        from fieldfuse.backends.triton import blocks
 
-        return tables_gpu.table(self.keys, self.table_origin, self.table_size)
+        return blocks.table(self.keys, self.table_origin, self.table_size)
 
     @property
     def table(self) -> Tensor:
@@ -162,12 +162,12 @@ class Topology:
     def around(self) -> Tensor:
         """(M, 27) int64 slots of the 3×3×3 blocks around each, −1 absent; column (dz+1)·9 + (dy+1)·3 + (dx+1), itself in column 13."""
         if self.bounds is not None and dispatch.can_use_triton(self.keys, dtypes=None):
-            from fieldfuse.backends.triton import tables as tables_gpu
+            from fieldfuse.backends.triton import blocks
 
             if self._among is None:
-                return tables_gpu.around(*self._placed)
+                return blocks.around(*self._placed)
             whole, chosen, slots = self._among
-            return tables_gpu.around(*whole._placed, chosen, slots)
+            return blocks.around(*whole._placed, chosen, slots)
         line = range(-1, 2)
         shifts = [(dx, dy, dz) for dz in line for dy in line for dx in line]
         sx, sy, _ = self.table_size

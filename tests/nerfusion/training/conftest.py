@@ -7,7 +7,7 @@ from collections.abc import Iterator
 import pytest
 import torch
 
-from fieldfuse.nerfusion.training import mixture, procedural, region
+from fieldfuse.nerfusion.training import mixture, procedural, samples
 
 
 @pytest.fixture(autouse=True, scope="package")
@@ -16,7 +16,7 @@ def small() -> Iterator[None]:
     monkeypatch = pytest.MonkeyPatch()
     monkeypatch.setattr(procedural, "TEXELS", 128)
     monkeypatch.setattr(mixture, "BANKS", 1)
-    monkeypatch.setattr(region, "LEAST", 16)
+    monkeypatch.setattr(samples, "LEAST", 16)
     before = torch.get_num_threads()
     torch.set_num_threads(1)
     yield

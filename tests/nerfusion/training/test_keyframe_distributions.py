@@ -5,7 +5,6 @@ from __future__ import annotations
 import math
 from pathlib import Path
 
-import numpy as np
 import torch
 
 from fieldfuse.nerfusion.extras.cross_view_consistency import confident_points, consistency, cross_view
@@ -13,10 +12,8 @@ from fieldfuse.nerfusion.extras.matching import patch_descriptors
 from fieldfuse.nerfusion.extras.plane_sweep import cost_volume, to_probability
 from fieldfuse.nerfusion.training.distributed import Crew
 from fieldfuse.nerfusion.training.mixture import Mixture
-from fieldfuse.nerfusion.training.procedural import ProceduralScene
-from fieldfuse.nerfusion.training.samples import cameras_of, keyframe_distributions
+from fieldfuse.nerfusion.training.samples import keyframe_distributions
 from fieldfuse.nerfusion.training.train import Trainer
-from fieldfuse.simulate.eye import take, take_all
 from tests.nerfusion.training.tiny import tiny_settings
 
 
@@ -24,7 +21,7 @@ def test_a_samples_sweeps_are_held_against_each_other() -> None:
     sample = Mixture(tiny_settings()).sample(0, 2)
     descriptors = patch_descriptors(sample.pictures.images)
     first, second = (
-        cost_volume([descriptors[k] for k in indices], cameras_of(sample.pictures, indices), sample.near, sample.far)
+        cost_volume([descriptors[k] for k in indices], sample.pictures.cameras(indices), sample.near, sample.far)
         for indices in sample.references
     )
     own_estimate = to_probability(first)
@@ -39,7 +36,7 @@ def test_one_key_frame_has_no_witness() -> None:
     sample = Mixture(tiny_settings()).sample(0, 1)
     indices = sample.references[0]
     descriptors = patch_descriptors(sample.pictures.images)
-    costs = cost_volume([descriptors[k] for k in indices], cameras_of(sample.pictures, indices), sample.near, sample.far)
+    costs = cost_volume([descriptors[k] for k in indices], sample.pictures.cameras(indices), sample.near, sample.far)
     (distribution,) = keyframe_distributions(sample)
     assert torch.equal(distribution.table, to_probability(costs).table)
 
@@ -51,11 +48,3 @@ def test_a_step_with_witnesses_learns_something_else(tmp_path: Path) -> None:
         rows.append(Trainer(settings, tmp_path / str(witnesses), Crew()).one_step())
     assert all(math.isfinite(row["loss"]) and row["skipped"] == 0 for row in rows)
     assert rows[0]["loss"] != rows[1]["loss"]
-
-
-def test_frames_drawn_at_once_are_those_drawn_alone() -> None:
-    scene = ProceduralScene("room", np.random.default_rng(1), 48, 8, 0)
-    for index, many in zip((1, 5), take_all(scene._scene, scene._eye, scene._poses[[1, 5]]), strict=True):
-        one = take(scene._scene, scene._eye, scene._poses[index][None])
-        for name in ("linear", "depth", "normals", "albedo", "gloss"):
-            torch.testing.assert_close(getattr(many, name), getattr(one, name), atol=1e-6, rtol=0)

@@ -11,9 +11,21 @@ import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from fieldfuse.nerfusion.losses import FLOOR, WIDTH, Traced, annealed, depth_likelihood, mean_likelihood, psnr, rendering_loss
-from fieldfuse.nerfusion.training.health import feature_deviation, opacity_histogram, relative_depth_error, saturation
-from fieldfuse.nerfusion.training.rays import TargetRays, picture_rays, random_rays
+from fieldfuse.nerfusion.training.curve import saturation
+from fieldfuse.nerfusion.training.rendering import (
+    FLOOR,
+    WIDTH,
+    TargetRays,
+    Traced,
+    annealed,
+    depth_likelihood,
+    feature_deviation,
+    picture_rays,
+    random_rays,
+    relative_depth_error,
+    rendering_health,
+    rendering_loss,
+)
 from fieldfuse.nerfusion.training.samples import Pictures
 from fieldfuse.nerfusion.training.step import Outcome
 
@@ -41,8 +53,9 @@ def some_rays(distance: torch.Tensor, colour: torch.Tensor, solid: torch.Tensor)
 def test_depth_likelihood_is_the_windowed_weight(seed: int) -> None:
     seen = traced(seed)
     truth = torch.from_numpy(np.random.default_rng(seed + 1).uniform(0.5, 4, 7)) * torch.tensor([1, 1, 0, 1, 1, 0, 1.0])
-    found, known = depth_likelihood(seen, truth)
-    assert known.tolist() == [True, True, False, True, True, False, True]
+    found = depth_likelihood(seen, truth)
+    assert found.isnan().tolist() == [False, False, True, False, False, True, False]
+    found = found[~found.isnan()]
     expected = []
     for ray in range(7):
         if truth[ray] > 0:
@@ -58,7 +71,7 @@ def test_depth_likelihood_is_the_windowed_weight(seed: int) -> None:
 def test_likelihood_is_best_with_all_weight_at_the_surface_and_its_gradient_points_there() -> None:
     weight = torch.tensor([0.3, 0.3, 0.3], requires_grad=True)
     seen = Traced(torch.zeros(1, 3), weight.sum()[None], weight, torch.tensor([1.0, 2.0, 3.0]), torch.zeros(3, dtype=torch.int64))
-    found, _ = depth_likelihood(seen, torch.tensor([2.0]))
+    found = depth_likelihood(seen, torch.tensor([2.0]))
     found.sum().backward()
     assert weight.grad is not None
     assert float(weight.grad[1]) > 1 > 1e-3 > abs(float(weight.grad[0]))
@@ -83,17 +96,15 @@ def test_rendering_loss_is_its_three_terms() -> None:
     parts = rendering_loss(seen, some_rays(truth, colour, solid), 0.5, 0.25)
     error = ((seen.colour - colour) ** 2).mean()
     opacity = ((1 - seen.opacity[solid]) ** 2).mean()
-    depth = -depth_likelihood(seen, truth)[0].mean()
+    depth = -depth_likelihood(seen, truth).mean()
     assert float(parts.total) == pytest.approx(float(error + 0.5 * opacity + 0.25 * depth))
     without = rendering_loss(seen, some_rays(truth, colour, torch.zeros(7, dtype=torch.bool)), 0.5, 0.0)
     assert float(without.total) == pytest.approx(float(error)) and float(without.depth) == 0 and float(without.opacity) == 0
 
 
 def test_means_are_over_what_is_known() -> None:
-    seen, truth = traced(5), torch.linspace(0.6, 3, 7).double()
-    truth[::2] = 0
-    assert float(mean_likelihood(seen, truth, 0.1)) == pytest.approx(float(depth_likelihood(seen, truth, 0.1)[0].mean()))
-    assert mean_likelihood(seen, torch.zeros_like(truth)).isnan()
+    blank = torch.zeros(7)
+    assert rendering_health(traced(5), some_rays(blank, torch.zeros(7, 3), blank > 0))["depth_likelihood"].isnan()
     outcome = Outcome()
     assert outcome.means() == {}
     outcome.note({"some": torch.tensor(1.0), "none": torch.tensor(torch.nan)})
@@ -109,18 +120,16 @@ def test_the_depth_weight_falls_to_exactly_zero() -> None:
     assert annealed(0.2, 0, 0) == 0.0
 
 
-def test_psnr() -> None:
-    assert psnr(0.01) == pytest.approx(20.0)
-    assert psnr(torch.tensor(0.0)) == pytest.approx(100.0)
-
-
 def test_health_numbers() -> None:
     flat, lively = torch.full((2, 4, 8, 8), 3.0), torch.randn(2, 4, 8, 8, generator=torch.Generator().manual_seed(0))
     assert float(feature_deviation(flat)) == 0.0
     assert float(feature_deviation(lively)) == pytest.approx(1.0, abs=0.1)
     assert saturation(torch.tensor([0.001, 0.5, 0.995, 0.5])) == 0.5 and saturation(torch.zeros(0)) == 0.0
-    shares = {name: float(share) for name, share in opacity_histogram(torch.tensor([0.1, 0.2, 0.5, 0.9])).items()}
-    assert shares == pytest.approx({"opacity_low": 0.5, "opacity_middle": 0.25, "opacity_high": 0.25})
+    weight, none = torch.tensor([0.1, 0.2, 0.5, 0.9]), torch.zeros(4)
+    seen = Traced(torch.zeros(4, 3), weight, weight, torch.ones(4), torch.arange(4))
+    health = {name: float(value) for name, value in rendering_health(seen, some_rays(none, torch.full((4, 3), 0.1), none > 0)).items()}
+    assert (health["opacity_low"], health["opacity_middle"], health["opacity_high"]) == pytest.approx((0.5, 0.25, 0.25))
+    assert health["psnr"] == pytest.approx(20.0)
     assert relative_depth_error(torch.tensor([1.1, 0.0, 4.0]), torch.tensor([1.0, 2.0, 0.0])).item() == pytest.approx(0.1)
     assert relative_depth_error(torch.zeros(2), torch.ones(2)).isnan()
 

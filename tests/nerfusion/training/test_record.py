@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from dataclasses import asdict
 from pathlib import Path
 
 import cv2
@@ -11,7 +12,7 @@ from typer.testing import CliRunner
 
 from fieldfuse.errors import InputError
 from fieldfuse.nerfusion.training.curve import Curve, draw_curve, smoothed
-from fieldfuse.nerfusion.training.settings import load_train_settings, train_settings_dict
+from fieldfuse.nerfusion.training.settings import load_train_settings
 from tests.nerfusion.training.tiny import SMALL
 
 CONFIGS = Path(__file__).resolve().parents[3] / "configs" / "train"
@@ -22,7 +23,7 @@ RATES = {"paper.yaml": 3e-3, "cpu.yaml": 6e-4, "gpu.yaml": 4e-4}  # the paper's,
 def test_shipped_settings_load(path: Path) -> None:
     settings = load_train_settings(path)
     assert settings.total_steps > 100 and settings.optimiser.rate == RATES[path.name] and settings.pictures.views == 3
-    assert load_train_settings(data=train_settings_dict(settings)) == settings
+    assert load_train_settings(data=asdict(settings)) == settings
 
 
 @pytest.mark.parametrize(

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from types import SimpleNamespace
+from typing import Any
 
 import numpy as np
 import pytest
@@ -11,16 +13,30 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from fieldfuse.errors import InputError
-from fieldfuse.nerfusion.training import region
-from fieldfuse.nerfusion.training.drawing import depth_range, draw_sample
+from fieldfuse.nerfusion.training import samples
 from fieldfuse.nerfusion.training.mixture import Mixture
 from fieldfuse.nerfusion.training.procedural import ProceduralScene
-from fieldfuse.nerfusion.training.rays import in_sight, picture_rays
-from fieldfuse.nerfusion.training.region import lattice_resolution, region_around, surface_points
-from fieldfuse.nerfusion.training.samples import Pictures, choose_views, view_distance
+from fieldfuse.nerfusion.training.rendering import in_sight, picture_rays
+from fieldfuse.nerfusion.training.samples import (
+    Pictures,
+    choose_views,
+    depth_range,
+    draw_sample,
+    lattice_resolution,
+    region_around,
+    surface_points,
+    view_distance,
+)
+from fieldfuse.nerfusion.training.settings import PictureSettings
 from fieldfuse.volume.space import Space
 from tests.nerfusion.training import layouts
 from tests.nerfusion.training.tiny import tiny_settings
+
+
+def choose(count: int, ordered: bool, kind: str, seed: int, views: int = 3, key_frames: int = 1, targets: int = 2) -> Any:
+    """References and targets of a ring of cameras at a distance of 2."""
+    scene = SimpleNamespace(world_from_camera=ring(count), ordered=ordered, kind=kind, depth_hint=2.0)
+    return choose_views(scene, np.random.default_rng(seed), PictureSettings(views=views, targets=targets), key_frames)
 
 
 def ring(count: int) -> np.ndarray:
@@ -45,57 +61,49 @@ def ring(count: int) -> np.ndarray:
     seed=st.integers(0, 99),
 )
 def test_choices_are_always_usable(count: int, ordered: bool, kind: str, views: int, key_frames: int, targets: int, seed: int) -> None:
-    def choose():  # type: ignore[no-untyped-def]
-        return choose_views(
-            ring(count), ordered, kind, np.random.default_rng(seed), views=views, key_frames=key_frames, targets=targets, depth=2.0
-        )
-
+    given = count, ordered, kind, seed, views, key_frames, targets
     if count < views + 1:
         with pytest.raises(InputError, match=f"at least {views + 1} frames"):
-            choose()
+            choose(*given)
         return
-    choice = choose()
-    assert choice.references.shape == (key_frames, views) and choice.targets.shape == (key_frames, targets)
-    assert choice.references.min() >= 0 and max(choice.references.max(), choice.targets.max()) < count
-    for references, wanted in zip(choice.references, choice.targets, strict=True):
-        assert len(set(references)) == views
-        assert not set(references) & set(wanted)
+    references, wanted = choose(*given)
+    assert references.shape == (key_frames, views) and wanted.shape == (key_frames, targets)
+    assert references.min() >= 0 and max(references.max(), wanted.max()) < count
+    for row, others in zip(references, wanted, strict=True):
+        assert len(set(row)) == views and not set(row) & set(others)
 
 
 def test_key_frames_of_a_video_are_two_to_five_percent_of_it() -> None:
     """The paper's rule for rooms: they follow each other in time, 20 to 50 frames apart."""
     for seed in range(20):
-        choice = choose_views(ring(1000), True, "room", np.random.default_rng(seed), views=3, key_frames=4, targets=1, depth=2.0)
-        steps = np.diff(choice.references[:, 0])
+        references, _ = choose(1000, True, "room", seed, key_frames=4, targets=1)
+        steps = np.diff(references[:, 0])
         assert np.all(steps == steps[0]) and 20 <= steps[0] <= 50
-        for row in choice.references:
+        for row in references:
             # Neighbours in time, on both sides; at the ends of the video both on one side.
             assert sorted(np.abs(row - row[0])) in ([0, steps[0], steps[0]], [0, steps[0], 2 * steps[0]])
             assert steps[0] < row[0] < 999 - steps[0] or np.ptp(row) == 2 * steps[0]
 
 
 def test_objects_use_sixteen_pictures_and_refer_to_near_ones() -> None:
-    poses = ring(200)
-    apart = view_distance(poses, 2.0)
+    apart = view_distance(ring(200), 2.0)
     for seed in range(10):
-        choice = choose_views(poses, False, "object", np.random.default_rng(seed), views=3, key_frames=12, targets=2, depth=2.0)
-        used = np.unique(np.concatenate([choice.references.ravel(), choice.targets.ravel()]))
+        references, targets = choose(200, False, "object", seed, key_frames=12)
+        used = np.unique(np.concatenate([references.ravel(), targets.ravel()]))
         assert len(used) <= 16
-        for row in choice.references:
+        for row in references:
             others = [apart[row[0], i] for i in used if i != row[0]]
             assert apart[row[0], row[1:]].max() <= np.sort(others)[4]
 
 
 @pytest.mark.parametrize(("ordered", "kind"), [(False, "object"), (True, "room")])
 def test_half_of_the_targets_are_near_and_the_others_anywhere(ordered: bool, kind: str) -> None:
-    poses = ring(60)
-    apart = view_distance(poses, 2.0)
+    apart = view_distance(ring(60), 2.0)
     near, far = [], []
     for seed in range(60):
-        choice = choose_views(poses, ordered, kind, np.random.default_rng(seed), views=3, key_frames=1, targets=2, depth=2.0)
-        key = int(choice.references[0, 0])
-        near.append(apart[key, choice.targets[0, 0]])
-        far.append(apart[key, choice.targets[0, 1]])
+        references, targets = choose(60, ordered, kind, seed)
+        near.append(apart[references[0, 0], targets[0, 0]])
+        far.append(apart[references[0, 0], targets[0, 1]])
     middle = float(np.median(apart[0]))
     assert np.median(near) < 0.6 * middle < np.median(far) and max(far) > 1.5 * middle
 
@@ -153,7 +161,7 @@ def test_resolution_follows_the_voxel_size_within_bounds() -> None:
     space = Space((0.0, 0.0, 0.0), 1.0, 1.0)
     assert lattice_resolution(space, 0.05, 96) == 80
     assert lattice_resolution(space, 1e-4, 96) == 96
-    assert lattice_resolution(space, 10.0, 96) == region.LEAST
+    assert lattice_resolution(space, 10.0, 96) == samples.LEAST
 
 
 def test_depth_range_falls_back_to_the_hint_and_refuses_without() -> None:

@@ -9,13 +9,9 @@ import pytest
 import torch
 
 from fieldfuse.errors import InputError
-from fieldfuse.nerfusion.training.paths import around, hand_held, look_at, wander
-from fieldfuse.nerfusion.training.procedural import ProceduralScene
-from fieldfuse.nerfusion.training.shards import ShardScene, shard_files, write_shard
-
-
-def in_open_space(points: np.ndarray) -> np.ndarray:
-    return np.full(len(points), 10.0)
+from fieldfuse.nerfusion.training.procedural import ProceduralScene, around, hand_held, look_at, wander
+from fieldfuse.nerfusion.training.scenes import ShardScene, shard_files, write_shard
+from fieldfuse.simulate.eye import take, take_all
 
 
 def test_cameras_look_at_their_targets_and_stand_upright() -> None:
@@ -29,11 +25,6 @@ def test_cameras_look_at_their_targets_and_stand_upright() -> None:
         assert pose[2, 0] == pytest.approx(0, abs=1e-9) and pose[2, 1] < 0  # x level, y down
     rolled = look_at(centres, targets, np.full(20, 0.3))
     assert np.allclose(rolled[:, :3, 2], poses[:, :3, 2])
-
-
-def test_straight_down_is_a_pose_too() -> None:
-    (pose,) = look_at(np.array([[0, 0, 2.0]]), np.zeros((1, 3)), np.zeros(1))
-    assert np.isfinite(pose).all() and np.linalg.det(pose[:3, :3]) == pytest.approx(1)
 
 
 def test_a_wander_is_smooth_and_of_its_size() -> None:
@@ -141,3 +132,11 @@ def test_what_is_not_a_shard_is_refused(tmp_path: Path) -> None:
         write_shard(
             tmp_path / "c", np.zeros((2, 3, 4, 4)), np.zeros((3, 4, 4)), np.zeros((2, 4)), np.zeros((2, 4, 4)), kind="x", ordered=True
         )
+
+
+def test_frames_drawn_at_once_are_those_drawn_alone() -> None:
+    scene = ProceduralScene("room", np.random.default_rng(1), 48, 8, 0)
+    for index, many in zip((1, 5), take_all(scene._scene, scene._eye, scene._poses[[1, 5]]), strict=True):
+        one = take(scene._scene, scene._eye, scene._poses[index][None])
+        for name in ("linear", "depth", "normals", "albedo", "gloss"):
+            torch.testing.assert_close(getattr(many, name), getattr(one, name), atol=1e-6, rtol=0)

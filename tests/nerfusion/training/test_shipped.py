@@ -9,9 +9,9 @@ import torch
 
 from fieldfuse.nerfusion import weights
 from fieldfuse.nerfusion.model import ModelConfig, NerfusionModel
-from fieldfuse.nerfusion.training.drawing import draw_sample
 from fieldfuse.nerfusion.training.procedural import ProceduralScene
-from fieldfuse.nerfusion.training.step import LOCAL, Outcome, Stepper, local_of, seeded
+from fieldfuse.nerfusion.training.samples import draw_sample
+from fieldfuse.nerfusion.training.step import LOCAL, StepLoss, Stepper, local_of, seeded
 from tests.nerfusion.training.tiny import tiny_settings
 
 FILE = Path(weights.__file__).parent / "weights" / "nerfusion.safetensors"
@@ -25,9 +25,9 @@ def measured(model: NerfusionModel) -> dict[str, float]:
         for seed in range(4):
             scene = ProceduralScene("object", np.random.default_rng([99, seed]), 144, 12)
             sample = draw_sample(scene, np.random.default_rng(seed), settings.pictures, settings.volume, 1)
-            log = Outcome()
-            stepper._loss(local_of(model, sample, 0), sample, sample.targets[0], sample.references[0], 512, LOCAL, 0, seeded(0, 0, 0), log)
-            rows.append(log.means())
+            loss = StepLoss(stepper, sample, 0, seeded(0, 0, 0))
+            loss(local_of(model, sample, 0), sample.targets[0], sample.references[0], 512, LOCAL)
+            rows.append(loss.outcome.means())
     return {name: float(np.mean([row[name] for row in rows])) for name in ("psnr_local", "depth_likelihood", "depth_error")}
 
 

@@ -8,6 +8,7 @@ import os
 import subprocess
 import sys
 from collections.abc import Iterable
+from dataclasses import asdict
 from itertools import pairwise
 from pathlib import Path
 
@@ -18,15 +19,14 @@ from safetensors import safe_open
 from safetensors.torch import load_file, save_file
 
 from fieldfuse.errors import InputError
-from fieldfuse.nerfusion.training.caution import RECOVER, Caution
-from fieldfuse.nerfusion.training.checkpoint import checkpoint_settings, checkpoints
+from fieldfuse.nerfusion.training.checkpoint import TrainState, checkpoints, load_checkpoint
 from fieldfuse.nerfusion.training.curve import Curve, draw_curve
 from fieldfuse.nerfusion.training.distributed import Crew, join_crew
-from fieldfuse.nerfusion.training.health import ALIVE
+from fieldfuse.nerfusion.training.optimiser import RECOVER, NonfinitePolicy, learning_rate
+from fieldfuse.nerfusion.training.rendering import ALIVE
 from fieldfuse.nerfusion.training.step import local_of
-from fieldfuse.nerfusion.training.train import WEIGHTS, Trainer, learning_rate, make_model
+from fieldfuse.nerfusion.training.train import WEIGHTS, Trainer, make_model
 from fieldfuse.nerfusion.weights import load_model
-from fieldfuse.progress import Progress
 from tests.nerfusion.training.tiny import SMALL, merged, tiny_settings
 
 ROOT = Path(__file__).resolve().parents[3]
@@ -65,7 +65,9 @@ def test_a_run_leaves_weights_curve_and_checkpoint(tmp_path: Path, monkeypatch: 
     # Every part learns: the fusion in stage 2 only, all others from the first step.
     moved = {name.split(".")[0] for name, value in state(trainer).items() if not torch.equal(value, before[name])}
     assert moved == {name.split(".")[0] for name in before}
-    assert checkpoint_settings(checkpoints(tmp_path)[-1])["loss"]["rays"] == SMALL["loss"]["rays"]
+    again = make_model(trainer.settings)
+    read = load_checkpoint(checkpoints(tmp_path)[-1], TrainState(again, torch.optim.Adam(again.parameters())))
+    assert read["loss"]["rays"] == SMALL["loss"]["rays"]
 
 
 def test_what_is_shipped_is_the_average_along_the_run(tmp_path: Path) -> None:
@@ -93,13 +95,13 @@ def test_resuming_repeats_every_bit(tmp_path: Path) -> None:
         first = Trainer(settings, tmp_path / "parts", Crew(), resume=stop > 1)
         assert first.run(until=stop) == stop
     second = Trainer(settings, tmp_path / "parts", Crew(), resume=True)
-    assert second.step == 3 and same(state(first), state(second)) and same(first.average.values, second.average.values)
+    assert second.state.step == 3 and same(state(first), state(second)) and same(first.average.values, second.average.values)
     second.run()
     assert same(state(whole), state(second)) and same(whole.average.values, second.average.values)
     assert (tmp_path / "whole" / WEIGHTS).read_bytes() == (tmp_path / "parts" / WEIGHTS).read_bytes()
     for a, b in zip(whole.model.parameters(), second.model.parameters(), strict=True):
         for name in ("step", "exp_avg", "exp_avg_sq"):
-            assert torch.equal(whole.adam.state[a][name], second.adam.state[b][name])
+            assert torch.equal(whole.state.adam.state[a][name], second.state.adam.state[b][name])
     once, twice = (
         [{k: v for k, v in row.items() if not k.startswith("seconds")} for row in trainer.curve.rows] for trainer in (whole, second)
     )
@@ -117,21 +119,7 @@ def test_a_kill_between_two_files_of_a_save_costs_no_row_of_the_curve(tmp_path: 
         patched.setattr("fieldfuse.nerfusion.training.train.save_model", killed)  # the checkpoint is there then
         first.run(until=1)
     second = Trainer(tiny_settings(), tmp_path, Crew(), resume=True)
-    assert second.step == 1 and [row["step"] for row in second.curve.rows] == [1]
-
-
-def test_a_request_to_stop_keeps_what_there_is(tmp_path: Path) -> None:
-    class StopAtTwo(Progress):
-        done = 0.0
-
-        def update(self, done: float, total: float, note: str = "") -> None:
-            self.done = done
-
-        def stopping(self) -> bool:
-            return self.done >= 1
-
-    assert Trainer(tiny_settings(), tmp_path, Crew()).run(progress=StopAtTwo()) == 2
-    assert checkpoints(tmp_path)[-1].name == "checkpoint-0000002.safetensors"
+    assert second.state.step == 1 and [row["step"] for row in second.curve.rows] == [1]
 
 
 def test_a_second_run_does_not_overwrite_the_first(tmp_path: Path) -> None:
@@ -166,7 +154,7 @@ def test_training_starts_from_given_weights(tmp_path: Path) -> None:
     first = Trainer(tiny_settings(), tmp_path / "first", Crew())
     first.run(until=2)
     second = Trainer(tiny_settings(start_from=str(tmp_path / "first" / WEIGHTS)), tmp_path / "second", Crew())
-    assert second.step == 0 and same(state(first), state(second))
+    assert second.state.step == 0 and same(state(first), state(second))
     with pytest.raises(InputError, match="model: channels is 12, and 8 in the weights"):
         make_model(tiny_settings(start_from=str(tmp_path / "first" / WEIGHTS), model={"channels": 12}))
     with pytest.raises(InputError, match="pretrained and start_from"):
@@ -220,24 +208,24 @@ def test_a_bad_step_moves_nothing_and_the_next_ones_are_smaller(loss: bool, tmp_
     before = state(trainer)
     poison(trainer, monkeypatch, {0}, loss)
     row = trainer.one_step()
-    assert same(before, state(trainer)) and not trainer.adam.state and row["skipped"] == 1
+    assert same(before, state(trainer)) and not trainer.state.adam.state and row["skipped"] == 1
     name = next(name for name, _ in trainer.model.named_parameters())
-    assert trainer.caution.last == ("step 1: the loss" if loss else f"step 1: the gradient of {name}")
-    trainer.step = 1
+    assert trainer.state.policy.last == ("step 1: the loss" if loss else f"step 1: the gradient of {name}")
+    trainer.state.step = 1
     row = trainer.one_step()
     assert row["rate"] == learning_rate(trainer.settings, 1) / 2 and row["skipped"] == 0 and not same(before, state(trainer))
     for _ in range(RECOVER - 1):
-        trainer.caution.well()
-    assert trainer.caution == Caution(met=1, last=trainer.caution.last)
+        trainer.state.policy.well()
+    assert trainer.state.policy == NonfinitePolicy(met=1, last=trainer.state.policy.last)
 
 
 def test_training_gives_up_with_the_weights_of_the_last_good_step(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     trainer = Trainer(tiny_settings(), tmp_path, Crew())
     poison(trainer, monkeypatch, range(4))
-    monkeypatch.setattr("fieldfuse.nerfusion.training.caution.MOST", 2)
+    monkeypatch.setattr("fieldfuse.nerfusion.training.optimiser.MOST", 2)
     with pytest.raises(InputError, match=r"the last at step 2 in the gradient of .*; the weights of the last good step"):
         trainer.run()
-    assert trainer.caution.slower == 0.25
+    assert trainer.state.policy.slower == 0.25
     loaded = load_model(tmp_path / WEIGHTS)
     assert same(loaded.state_dict(), state(trainer)) and all(bool(torch.isfinite(v).all()) for v in loaded.state_dict().values())
 
@@ -250,7 +238,7 @@ def test_resuming_after_a_bad_step_repeats_every_bit(tmp_path: Path, monkeypatch
     poison(first, monkeypatch, {0})
     first.run(1)
     second = Trainer(tiny_settings(), tmp_path / "parts", Crew(), resume=True)
-    assert second.caution == first.caution and second.caution.slower == 0.5
+    assert second.state.policy == first.state.policy and second.state.policy.slower == 0.5
     second.run(2)
     assert same(state(whole), state(second))
 
@@ -262,12 +250,12 @@ def test_a_checkpoint_with_a_damaged_record_of_bad_steps_is_refused(change: dict
     (path,) = checkpoints(tmp_path)
     with safe_open(path, "pt") as file:
         tensors, meta = {name: file.get_tensor(name) for name in file.keys()}, dict(file.metadata())  # noqa: SIM118
-    save_file(tensors, path, {**meta, "caution": json.dumps({**Caution().to_dict(), **change})})
+    save_file(tensors, path, {**meta, "caution": json.dumps({**asdict(NonfinitePolicy()), **change})})
     with pytest.raises(InputError, match="is not a training checkpoint"):
         Trainer(tiny_settings(), tmp_path, Crew(), resume=True)
     del meta["caution"]
     save_file(tensors, path, meta)
-    assert Trainer(tiny_settings(), tmp_path, Crew(), resume=True).caution == Caution()
+    assert Trainer(tiny_settings(), tmp_path, Crew(), resume=True).state.policy == NonfinitePolicy()
 
 
 WORKER = """
@@ -304,15 +292,6 @@ def test_two_processes_stay_equal_and_see_different_samples(tmp_path: Path) -> N
     assert len(checkpoints(tmp_path)) == 1  # the leader alone writes
 
 
-def test_averaging_alone_changes_nothing_and_a_crew_of_one_needs_no_group() -> None:
-    with join_crew("cpu") as crew:
-        assert (crew.rank, crew.size, crew.leads) == (0, 1, True)
-        parameter = torch.nn.Parameter(torch.ones(3))
-        parameter.grad = torch.tensor([1.0, 2.0, 3.0])
-        crew.average_gradients([parameter])
-        assert parameter.grad.tolist() == [1.0, 2.0, 3.0] and crew.any(True) and crew.mean({"a": 2.0}) == {"a": 2.0}
-
-
 @pytest.mark.parametrize(("processes", "backend"), [(8, "gloo"), (2, "nccl")])
 def test_processes_that_share_a_device_meet_on_the_processor(processes: int, backend: str, monkeypatch: pytest.MonkeyPatch) -> None:
     begun: list[str] = []
@@ -325,7 +304,7 @@ def test_processes_that_share_a_device_meet_on_the_processor(processes: int, bac
         monkeypatch.setenv(name, str(number))
     with join_crew("cuda") as crew:
         assert begun == [backend] and crew.device == torch.device("cuda", 1)
-        assert crew.meeting == (torch.device("cpu") if backend == "gloo" else crew.device)
+        assert crew.exchange_device == (torch.device("cpu") if backend == "gloo" else crew.device)
 
 
 @pytest.mark.parametrize("device", ["tpu", "cuda"])
@@ -372,9 +351,3 @@ def check_health(rows: list[dict[str, float]]) -> None:
 
 def test_training_briefly_keeps_features_alive_and_finds_depth(tmp_path: Path) -> None:
     check_health(health_run(tmp_path, steps=200, scenes=2))
-
-
-@pytest.mark.slow
-@pytest.mark.skipif(not os.environ.get("FIELDFUSE_SLOW"), reason="two minutes of training: set FIELDFUSE_SLOW=1")
-def test_training_for_two_minutes_keeps_features_alive_and_finds_depth(tmp_path: Path) -> None:
-    check_health(health_run(tmp_path, steps=800, scenes=6))

@@ -12,9 +12,8 @@ import torch
 from fieldfuse.camera import Intrinsics
 from fieldfuse.errors import InputError
 from fieldfuse.nerfusion.training.procedural import ProceduralScene
-from fieldfuse.nerfusion.training.real import load_cases
 from fieldfuse.nerfusion.training.train import make_model
-from fieldfuse.nerfusion.training.validate import predict, validate
+from fieldfuse.nerfusion.training.validate import Validation, load_cases, predict, validate
 from tests.conftest import shared_data
 from tests.nerfusion.training.layouts import write, write_matrix
 from tests.nerfusion.training.tiny import tiny_settings
@@ -70,7 +69,7 @@ def test_numbers_and_sheet_of_a_validation(folder: Path, tmp_path: Path) -> None
     settings = wanted()
     model = make_model(settings)
     cases = load_cases(folder, settings)
-    numbers, each = validate(model, cases, torch.device("cpu"), tmp_path / "sheet.png", levels=2)
+    numbers, each = validate(model, cases, torch.device("cpu"), Validation(levels=2), tmp_path / "sheet.png")
     names = {"psnr_local", "psnr_fused", "psnr_fused_1", "psnr_nearest", "depth_error", "depth_likelihood"}
     assert {f"val_{name}" for name in names} == set(numbers)
     assert each.keys() == {"room"} and all(np.isfinite(list(numbers.values())))

@@ -16,8 +16,6 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
-from fieldfuse.files import write_json
-
 ROOT = Path(__file__).resolve().parents[3]
 
 
@@ -30,13 +28,6 @@ class Result:
     targets: Counter[str] = field(default_factory=Counter)
     refused: int = 0
     problems: list[dict[str, Any]] = field(default_factory=list)
-
-    def add(self, other: Result) -> None:
-        self.inputs += other.inputs
-        self.seconds += other.seconds
-        self.targets.update(other.targets)
-        self.refused += other.refused
-        self.problems += other.problems
 
     def lines(self) -> list[str]:
         """As a table for people."""
@@ -58,15 +49,14 @@ class Result:
 
 
 Told = Callable[[Result], None]
-ROUND = 2000  # inputs between two notes of a run that can be taken up again
 
 
-def fuzz(inputs: int, seed: int, jobs: int = 1, only: list[str] | None = None, told: Told | None = None, first: int = 0) -> Result:
-    """Read the damaged files `first` … `first + inputs` of a seed in `jobs` processes."""
+def fuzz(inputs: int, seed: int, jobs: int = 1, only: list[str] | None = None, told: Told | None = None) -> Result:
+    """Read so many damaged files of a seed in `jobs` processes."""
     result = Result()
     began = time.monotonic()
-    share, stop = -(-inputs // jobs), first + inputs
-    parts = [(start, min(share, stop - start)) for start in range(first, stop, share)]
+    share = -(-inputs // jobs)
+    parts = [(start, min(share, inputs - start)) for start in range(0, inputs, share)]
     with tempfile.TemporaryDirectory(prefix="fieldfuse-fuzz-") as folder, ThreadPoolExecutor(jobs) as pool:
 
         def work(part: tuple[int, int]) -> None:
@@ -77,28 +67,14 @@ def fuzz(inputs: int, seed: int, jobs: int = 1, only: list[str] | None = None, t
     return result
 
 
-def fuzz_in_rounds(state: Path, inputs: int, seed: int, jobs: int = 1, only: list[str] | None = None, told: Told | None = None) -> Result:
-    """The same, noting after every round in the file `state` what was read: started again it goes on from there.
+def survey(inputs: int, seed: int, jobs: int, only: list[str]) -> tuple[list[str], list[str]]:
+    """What was wrong as lines of JSON, and lines for the page."""
 
-    Raises:
-        ValueError: the file belongs to another seed or to other targets.
-    """
-    mine = {"seed": seed, "only": only or []}
-    whole, first = Result(), 0
-    if state.exists():
-        kept = json.loads(state.read_text(encoding="utf-8"))
-        if kept["run"] != mine:
-            raise ValueError(f"{state} was begun with {kept['run']}, not with {mine}")
-        whole = Result(**{**kept["result"], "targets": Counter(kept["result"]["targets"])})
-        first = kept["next"]
-    while whole.inputs < inputs:
-        count = min(ROUND, inputs - whole.inputs)
-        whole.add(fuzz(count, seed, jobs, only, first=first))
-        first += count  # not the inputs counted: those of a worker that crashed since its last message are not in the sum
-        write_json(state, {"run": mine, "next": first, "result": vars(whole)})
-        if told is not None:
-            told(whole)
-    return whole
+    def told(result: Result) -> None:
+        sys.stderr.write(f"{result.inputs} inputs, {len(result.problems)} problems\n")
+
+    result = fuzz(inputs, seed, jobs, only, told)
+    return [json.dumps(problem) for problem in result.problems], result.lines()
 
 
 def _one_range(folder: Path, seed: int, first: int, count: int, only: list[str], result: Result, told: Told | None) -> None:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
@@ -14,18 +13,24 @@ from safetensors.numpy import save_file
 from fieldfuse.camera import Intrinsics
 from fieldfuse.capture import open_capture
 from fieldfuse.capture.types import Views
-from fieldfuse.errors import FieldfuseError
 from fieldfuse.evaluation.compare_truth import find_truth, true_depths
 from fieldfuse.files import write_json
-from fieldfuse.nerfusion.training.captured import CapturedScene
-from fieldfuse.nerfusion.training.datasets.dtu import dtu_scene, dtu_scenes
-from fieldfuse.nerfusion.training.datasets.scanned_objects import scanned_object_folders, scanned_object_scene
-from fieldfuse.nerfusion.training.datasets.scannet import scannet_folders, scannet_scene
-from fieldfuse.nerfusion.training.datasets.synthetic import synthetic_folders, synthetic_scene
+from fieldfuse.nerfusion.training.scenes import (
+    CapturedScene,
+    dtu_scene,
+    dtu_scenes,
+    scanned_object_folders,
+    scanned_object_scene,
+    scannet_folders,
+    scannet_scene,
+    synthetic_folders,
+    synthetic_scene,
+)
 from fieldfuse.simulate.eye import Rays
 from fieldfuse.simulate.mesh_scene import load_mesh_scene
 from tests.capture.layouts import LAYOUTS
 from tests.nerfusion.training import layouts
+from tests.stability.fuzz.watch import all_of
 
 MESHES = ("ascii.ply", "binary.ply", "coloured.ply", "model.obj", "model.mtl", "picture.png", "model.glb", "model.gltf")
 TRUTH = ("ground_truth/cameras.json", "ground_truth/0.safetensors", "ground_truth/mesh.ply")
@@ -125,15 +130,3 @@ def finite(scene: CapturedScene) -> None:
     found = scene.pictures([len(scene.world_from_camera) - 1])
     if not bool(torch.isfinite(found.world_from_camera).all() and torch.isfinite(found.intrinsics).all()):
         raise ValueError("a camera that is not finite")
-
-
-def all_of(*readers: Callable[[], object]) -> None:
-    """Call all; raise the first error that is no sentence, else the first."""
-    errors: list[Exception] = []
-    for read in readers:
-        try:
-            read()
-        except Exception as error:
-            errors.append(error)
-    for error in sorted(errors, key=lambda error: isinstance(error, FieldfuseError)):
-        raise error

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+from dataclasses import asdict
 from pathlib import Path
 
 import numpy as np
@@ -12,10 +13,9 @@ from fieldfuse.camera import Intrinsics
 from fieldfuse.evaluation import budget
 from fieldfuse.files import write_json
 from fieldfuse.nerfusion.model import ModelConfig, NerfusionModel
-from fieldfuse.nerfusion.training.caution import Caution
-from fieldfuse.nerfusion.training.checkpoint import checkpoint_settings, load_caution, load_checkpoint, save_checkpoint
-from fieldfuse.nerfusion.training.settings import load_train_settings, train_settings_dict
-from fieldfuse.nerfusion.training.shards import ShardScene, write_shard
+from fieldfuse.nerfusion.training.checkpoint import TrainState, load_checkpoint, save_checkpoint
+from fieldfuse.nerfusion.training.scenes import ShardScene, write_shard
+from fieldfuse.nerfusion.training.settings import load_train_settings
 from fieldfuse.nerfusion.weights import load_model, save_model
 from fieldfuse.render.bake import bake
 from fieldfuse.render.bake_file import read_baked, write_baked
@@ -73,7 +73,7 @@ def make_training(root: Path) -> None:
     for parameter in model.parameters():
         parameter.grad = torch.zeros_like(parameter)
     adam.step()
-    save_checkpoint(root, 7, model, adam, train_settings_dict(settings), 1, Caution())
+    save_checkpoint(root, TrainState(model, adam, step=7), asdict(settings), 1)
     (root / "train.yaml").write_text(
         "seed: 3\nstage: {steps: 10, fused_steps: 5}\noptimiser: {rate: 1e-3}\nsources:\n  - {kind: procedural}\n"
     )
@@ -98,8 +98,6 @@ def read_training(root: Path, number: int) -> None:
     load_left_out(root / "left_out.safetensors")
     model = make_model(tiny_settings())
     path = root / "checkpoint-0000007.safetensors"
-    load_checkpoint(path, model, torch.optim.Adam(model.parameters()))
-    load_caution(path)
-    checkpoint_settings(path)
+    load_checkpoint(path, TrainState(model, torch.optim.Adam(model.parameters())))
     if not all(bool(torch.isfinite(parameter).all()) for parameter in model.parameters()):
         raise ValueError("a weight that is not finite")

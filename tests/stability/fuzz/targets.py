@@ -7,7 +7,6 @@ import shutil
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
 import cv2
 import numpy as np
@@ -45,6 +44,7 @@ from tests.stability.fuzz.given import (
 from tests.stability.fuzz.models import make_models, make_training, read_baked_field, read_models, read_training
 from tests.stability.fuzz.results import FILES as RESULT_FILES
 from tests.stability.fuzz.results import MEASURED, make_measured, make_results, read_measured, read_results
+from tests.stability.fuzz.watch import all_of
 from tests.stability.hard.fields import aimed_rays, small_field
 
 Act = Callable[[Path, int], object]
@@ -230,7 +230,7 @@ def read_json_files(root: Path, number: int) -> None:
 
     folder = RunFolder(root)
     finished_stages(folder)
-    readers: tuple[Callable[[], Any], ...] = (
+    all_of(
         lambda: load_settings("balanced", stored=folder.about()["settings"]),
         lambda: capture_from_dict(read_json(root / "capture.json")),
         lambda: PoseResult.from_dict(read_json(root / "poses.json")),
@@ -238,14 +238,6 @@ def read_json_files(root: Path, number: int) -> None:
         lambda: read_cameras(root / "source" / "transforms.json"),
         lambda: load_settings("balanced", file=root / "settings.yaml"),
     )
-    first: Exception | None = None
-    for reader in readers:
-        try:
-            reader()
-        except Exception as error:  # the others are read all the same; the worker judges the first
-            first = first or error
-    if first is not None:
-        raise first
 
 
 RAYS = aimed_rays(8)
@@ -263,12 +255,7 @@ def read_fields(root: Path, number: int) -> None:
 def read_tensors(root: Path, number: int) -> None:
     from fieldfuse.pipelines.rendered import load_pictures
 
-    reader = (
-        lambda: load_views(root / "views.safetensors"),
-        lambda: load_pictures(root / "field.pictures.safetensors"),
-    )
-    for read in reader:
-        read()
+    all_of(lambda: load_views(root / "views.safetensors"), lambda: load_pictures(root / "field.pictures.safetensors"))
 
 
 RUN_FILES = ("run.json", "capture.json", "poses.json", "scene.json", "stages/views.json", "settings.yaml", "source/transforms.json")

@@ -7,10 +7,12 @@ import os
 import resource
 import signal
 import sys
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
+
+from fieldfuse.errors import FieldfuseError
 
 SYSTEM = ("/proc/self", "/proc/meminfo", "/proc/cpuinfo", "/sys/fs/cgroup", "/dev/null", "/dev/urandom")
 SECONDS = 5.0  # of computing: on a busy machine the wall clock says nothing about an input
@@ -100,3 +102,15 @@ def bound_memory(more: int = MEMORY) -> None:
 def tree(folder: Path) -> dict[str, tuple[int, int]]:
     """Every file below a folder with size and time: what must be the same after the inputs."""
     return {str(path.relative_to(folder)): (path.lstat().st_size, path.lstat().st_mtime_ns) for path in sorted(folder.rglob("*"))}
+
+
+def all_of(*readers: Callable[[], object]) -> None:
+    """Call all; raise the first error that is no sentence, else the first."""
+    errors: list[Exception] = []
+    for read in readers:
+        try:
+            read()
+        except Exception as error:
+            errors.append(error)
+    for error in sorted(errors, key=lambda error: isinstance(error, FieldfuseError)):
+        raise error

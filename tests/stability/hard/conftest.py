@@ -10,13 +10,13 @@ import numpy as np
 import pytest
 
 from tests.stability.hard.within import Within
-from tests.stability.page import case_lines, kernel_lines, replace_part
+from tests.stability.page import case_lines, replace_part
 
 RECORDS = pytest.StashKey[list[Within]]()
 
 
 def pytest_addoption(parser: pytest.Parser) -> None:
-    parser.addoption("--page", metavar="FILE", help="run the long cases too, and write the parts `cases` and `kernels` of this page")
+    parser.addoption("--page", metavar="FILE", help="run the long cases too, and write the part `cases` of this page")
 
 
 def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item]) -> None:
@@ -58,4 +58,3 @@ def pytest_sessionfinish(session: pytest.Session) -> None:
     page, records = session.config.getoption("--page", None), session.config.stash.get(RECORDS, [])
     if page and records:
         replace_part(Path(page), "cases", case_lines(records))
-        replace_part(Path(page), "kernels", kernel_lines(records))

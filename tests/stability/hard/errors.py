@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from typing import Any
 
 import numpy as np
@@ -43,6 +43,14 @@ def by_size(got: Any, wanted: Any) -> float:
     _, second = _pair(got, wanted)
     size = float(second.abs().max()) if second.numel() else 1.0
     return absolute(got, wanted) / (size if size >= SMALLEST else 1.0)
+
+
+def largest(errors: Iterable[dict[str, float]]) -> dict[str, float]:
+    """Of several results with the same names the largest of each."""
+    out: dict[str, float] = {}
+    for each in errors:
+        out = {name: max(out.get(name, 0.0), error) for name, error in each.items()}
+    return out
 
 
 def not_finite(*values: Any) -> float:

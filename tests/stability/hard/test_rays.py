@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from dataclasses import fields
+from collections.abc import Callable
 from itertools import pairwise
 
 import pytest
@@ -12,10 +12,10 @@ from hypothesis import given
 from hypothesis import strategies as st
 from torch import Tensor
 
-from fieldfuse.render.march import MarchGrid, Samples, march
+from fieldfuse.render.march import MarchGrid, march
 from fieldfuse.volume.topology import BLOCK, VOXELS
 from tests.stability.hard import reference
-from tests.stability.hard.errors import not_finite
+from tests.stability.hard.errors import largest, not_finite
 from tests.stability.hard.fields import lattice_grid, random_rays, unit
 from tests.stability.hard.ranges import QUICK
 from tests.stability.hard.within import Within
@@ -98,14 +98,69 @@ def _compare(
             worst[key] = max(worst[key], abs((following - t) * speed - 0.5 * (length + other)) / step)
 
 
-def test_random_half_empty(within: Within) -> None:
-    """Random rays through half-empty blocks."""
-    within.each(march_errors(lattice_grid(32, 0.5, 1), *random_rays(60, 2), fine=8), others=BOUNDS)
+def full() -> MarchGrid:
+    return lattice_grid(32, 1.0)
 
 
-def test_random_full(within: Within) -> None:
-    """Random rays through full blocks: nothing lost or doubled at borders."""
-    within.each(march_errors(lattice_grid(64, 1.0), *random_rays(60, 3)), others=BOUNDS)
+def parallel() -> tuple[Tensor, Tensor]:
+    axes = torch.cat([torch.eye(3), -torch.eye(3)]).repeat_interleave(4, 0)
+    offset = torch.rand(24, 3, generator=torch.Generator().manual_seed(0)) * 1.8 - 0.9
+    return -3 * axes + offset * (axes == 0), axes
+
+
+def along_edges() -> tuple[Tensor, Tensor]:
+    voxel = full().voxel
+    pairs = [(0, 8), (3, -8), (0, 0)]
+    rays = [(torch.tensor([j * voxel, k * voxel, k * voxel]) * (axis == 0) - 3 * axis, axis) for axis in torch.eye(3) for j, k in pairs]
+    corners = [torch.tensor([x, y, z]) for x in (-1.0, 1.0) for y in (-1.0, 1.0) for z in (0.0, 1.0)]
+    rays += [(-2 * corner, corner) for corner in corners]
+    return torch.stack([origin for origin, _ in rays]), unit(torch.stack([direction for _, direction in rays]))
+
+
+def from_inside() -> tuple[Tensor, Tensor]:
+    """From inside, from faces, from corners."""
+    starts = torch.tensor(
+        [[0.0, 0, 0], [0.31, -0.2, 0.77], [1.0, 0.1, 0.2], [-1.0, 0.1, 0.2], [0.25, 0.25, -1.0], [1.0, 1.0, 1.0], [-1.0, -1.0, -1.0]]
+    )
+    aims = unit(torch.randn(6, 3, generator=torch.Generator().manual_seed(3)))
+    return starts.repeat_interleave(6, 0), aims.repeat(len(starts), 1)
+
+
+def tiny_components() -> tuple[Tensor, Tensor]:
+    tiny = [0.0, -0.0, 1e-45, -1e-38, 1e-20, -1e-12, 1e-9, 1.1e-9, 1e-6]
+    directions = torch.tensor([[1.0, a, b] for a in tiny for b in tiny[::2]])
+    return torch.tensor([[-2.0, 0.11, -0.37]]).repeat(len(directions), 1), unit(directions)
+
+
+def grazing() -> tuple[Tensor, Tensor]:
+    offsets = [1 - 1e-3, 1 - 1e-5, -1 + 1e-3, -1 + 1e-5, -1.0]
+    origins = torch.tensor([[-3.0, offset, 0.2] for offset in offsets] + [[0.4, -3.0, offset] for offset in offsets])
+    directions = torch.tensor([[1.0, 0, 0]] * len(offsets) + [[0, 1.0, 0]] * len(offsets))
+    return torch.cat([origins, origins]), torch.cat([directions, unit(directions + torch.tensor([0.0, 0, 1e-4]))])
+
+
+def scaled(half: float) -> dict[str, float]:
+    origins, directions = random_rays(20, 11)
+    return march_errors(lattice_grid(32, 0.7, 3, half), origins * half, directions)
+
+
+CASES: dict[str, Callable[[], dict[str, float]]] = {
+    "random, through half-empty blocks": lambda: march_errors(lattice_grid(32, 0.5, 1), *random_rays(60, 2), fine=8),
+    "random, through full blocks": lambda: march_errors(lattice_grid(64, 1.0), *random_rays(60, 3)),
+    "parallel to faces, both ways along each axis": lambda: march_errors(lattice_grid(32, 0.6, 6), *parallel()),
+    "along edges of voxels and blocks, and through corners": lambda: march_errors(full(), *along_edges()),
+    "starting inside, on a face, on a corner": lambda: march_errors(lattice_grid(32, 0.8, 2), *from_inside()),
+    "zero, negative zero and tiny components": lambda: march_errors(lattice_grid(32, 0.6, 8), *tiny_components()),
+    "grazing the outer faces": lambda: march_errors(full(), *grazing()),
+    "tiny and huge extents": lambda: largest(scaled(half) for half in (1e-6, 1e-3, 1e3, 1e6)),
+    "8³ to 256³ voxels": lambda: largest(march_errors(lattice_grid(n, 0.9, 4), *random_rays(8, n)) for n in (8, 16, 128, 256)),
+}
+
+
+@pytest.mark.parametrize("case", CASES)
+def test_rays(case: str, within: Within) -> None:
+    """Samples lie where rays pass."""
+    within.each(CASES[case](), others=BOUNDS)
 
 
 def test_jittered(within: Within) -> None:
@@ -121,98 +176,21 @@ def test_jittered(within: Within) -> None:
     within.each(march_errors(grid, origins, directions, jitter=torch.linspace(0, 0.49, 40)), others=BOUNDS)
 
 
-def test_parallel(within: Within) -> None:
-    """Parallel to faces, both ways along each axis."""
-    axes = torch.cat([torch.eye(3), -torch.eye(3)]).repeat_interleave(4, 0)
-    offset = torch.rand(24, 3, generator=torch.Generator().manual_seed(0)) * 1.8 - 0.9
-    within.each(march_errors(lattice_grid(32, 0.6, 6), -3 * axes + offset * (axes == 0), axes), others=BOUNDS)
-
-
-def test_edges_and_corners(within: Within) -> None:
-    """Along edges of voxels and blocks, and through corners."""
-    grid = lattice_grid(32, 1.0)
-    voxel = grid.voxel
-    along = [
-        (torch.eye(3)[i], torch.tensor([j * voxel, k * voxel, k * voxel]) * (torch.eye(3)[i] == 0))
-        for i in range(3)
-        for j, k in ((0, 8), (3, -8), (0, 0))
-    ]
-    origins = [place - 3 * axis for axis, place in along]
-    directions = [axis for axis, _ in along]
-    for x in (-1.0, 1.0):
-        for y in (-1.0, 1.0):
-            directions += [torch.tensor([x, y, 1.0]), torch.tensor([x, y, 0.0])]
-            origins += [-2 * directions[-2], -2 * directions[-1]]
-    within.each(march_errors(grid, torch.stack(origins), unit(torch.stack(directions))), others=BOUNDS)
-
-
-def test_starting_inside(within: Within) -> None:
-    """Starting inside, on a face, on a corner."""
-    starts = torch.tensor(
-        [[0.0, 0, 0], [0.31, -0.2, 0.77], [1.0, 0.1, 0.2], [-1.0, 0.1, 0.2], [0.25, 0.25, -1.0], [1.0, 1.0, 1.0], [-1.0, -1.0, -1.0]]
-    )
-    aims = unit(torch.randn(6, 3, generator=torch.Generator().manual_seed(3)))
-    origins, directions = starts.repeat_interleave(6, 0), aims.repeat(len(starts), 1)
-    within.each(march_errors(lattice_grid(32, 0.8, 2), origins, directions), others=BOUNDS)
-
-
 def test_missing(within: Within) -> None:
     """Pointing away, missing by a hair, no ray at all."""
-    grid = lattice_grid(32, 1.0)
     origins, directions = random_rays(50, 9)
     hair = torch.tensor([[-3.0, 1.0001, 0], [-3.0, 0, -1.0001], [1.0001, 3.0, 0.5]])
-    ahead = torch.tensor([[1.0, 0, 0], [1.0, 0, 0], [0, -1.0, 0]])
-    none = torch.zeros((0, 3))
-    within("samples behind the start", float(len(march(grid, origins, -directions))), 0.0)
-    within("samples of rays that miss", float(len(march(grid, hair, ahead))), 0.0)
-    within("samples without rays", float(len(march(grid, none, none))), 0.0)
-
-
-def test_zero_components(within: Within) -> None:
-    """Directions with zero, negative zero and tiny components."""
-    tiny = [0.0, -0.0, 1e-45, -1e-38, 1e-20, -1e-12, 1e-9, 1.1e-9, 1e-6]
-    directions = torch.tensor([[1.0, a, b] for a in tiny for b in tiny[::2]])
-    origins = torch.tensor([[-2.0, 0.11, -0.37]]).repeat(len(directions), 1)
-    within.each(march_errors(lattice_grid(32, 0.6, 8), origins, unit(directions)), others=BOUNDS)
-
-
-def test_grazing(within: Within) -> None:
-    """Grazing the outer faces."""
-    offsets = [1 - 1e-3, 1 - 1e-5, -1 + 1e-3, -1 + 1e-5, -1.0]
-    origins = torch.tensor([[-3.0, offset, 0.2] for offset in offsets] + [[0.4, -3.0, offset] for offset in offsets])
-    directions = torch.tensor([[1.0, 0, 0]] * len(offsets) + [[0, 1.0, 0]] * len(offsets))
-    tilted = unit(directions + torch.tensor([0.0, 0, 1e-4]))
-    grid = lattice_grid(32, 1.0)
-    within.each(march_errors(grid, torch.cat([origins, origins]), torch.cat([directions, tilted])), others=BOUNDS)
-
-
-def test_extents(within: Within) -> None:
-    """Tiny and huge extents."""
-    worst = dict.fromkeys(BOUNDS, 0.0)
-    for half in (1e-6, 1e-3, 1e3, 1e6):
-        origins, directions = random_rays(20, 11)
-        errors = march_errors(lattice_grid(32, 0.7, 3, half), origins * half, directions)
-        worst = {name: max(worst[name], errors[name]) for name in worst}
-    within.each(worst, others=BOUNDS)
-
-
-def test_resolutions(within: Within) -> None:
-    """8³ to 256³ voxels."""
-    worst = dict.fromkeys(BOUNDS, 0.0)
-    for resolution in (8, 16, 128, 256):
-        errors = march_errors(lattice_grid(resolution, 0.9, 4), *random_rays(8, resolution))
-        worst = {name: max(worst[name], errors[name]) for name in worst}
-    within.each(worst, others=BOUNDS)
+    ahead, none = torch.tensor([[1.0, 0, 0], [1.0, 0, 0], [0, -1.0, 0]]), torch.zeros((0, 3))
+    for name, start, way in (("behind the start", origins, -directions), ("of rays that miss", hair, ahead), ("without rays", none, none)):
+        within(f"samples {name}", float(len(march(full(), start, way))), 0.0)
 
 
 def test_nearest(within: Within) -> None:
     """Nothing nearer than `near`."""
-    grid = lattice_grid(32, 1.0)
     origins, directions = random_rays(30, 6, away=0.5)
-    samples = march(grid, origins, directions, 0.4)
-    early = (0.4 - samples.distance).clamp_min(0).max() / grid.voxel
-    within("before it, in voxels", float(early), 0.5 + ROUNDING)
-    within.each(march_errors(grid, origins, directions, 0.4), others=BOUNDS)
+    samples = march(full(), origins, directions, 0.4)
+    within("before it, in voxels", float((0.4 - samples.distance).clamp_min(0).max() / full().voxel), 0.5 + ROUNDING)
+    within.each(march_errors(full(), origins, directions, 0.4), others=BOUNDS)
 
 
 def test_far_away(within: Within) -> None:
@@ -221,7 +199,7 @@ def test_far_away(within: Within) -> None:
     float32 places the samples of a ray that starts 1e5 away only to 0.008: what is stopped in all must still be right.
     """
     for away, steps in ((1e2, 1.0), (1e3, 1.0), (1e5, 2.0)):
-        grid = lattice_grid(32, 1.0)
+        grid = full()
         origins, directions = random_rays(40, 5, away, 0.3)
         samples = march(grid, origins, directions)
         covered = torch.zeros(40, dtype=torch.float64).index_add_(0, samples.ray, samples.length.double())
@@ -229,7 +207,7 @@ def test_far_away(within: Within) -> None:
             sum(b - a for a, b, _ in reference.crossings(tuple(o), tuple(d), (-1.0, -1.0, -1.0), grid.voxel, 32)) * math.dist((0, 0, 0), d)
             for o, d in zip(origins.double().tolist(), directions.double().tolist(), strict=True)
         ]
-        worst = (covered - torch.tensor(exact, dtype=torch.float64)).abs().max() / (grid.voxel)
+        worst = (covered - torch.tensor(exact, dtype=torch.float64)).abs().max() / grid.voxel
         within(f"length from {away:g} away, in steps", float(worst), steps + SPLIT)
         within(f"not finite from {away:g} away", not_finite(samples.distance, samples.length, samples.inside), 0.0)
 
@@ -242,23 +220,3 @@ def test_marching(resolution: int, share: float, seed: int, away: float, power: 
     errors = march_errors(lattice_grid(resolution, share, seed, half), origins * half, directions, fine=fine)
     for name, bound in BOUNDS.items():
         assert errors[name] <= bound, (name, errors[name])
-
-
-def test_lost_and_doubled_samples_are_noticed(monkeypatch: pytest.MonkeyPatch) -> None:
-    plain = march
-
-    def losing(*arguments: object, **options: object) -> Samples:
-        samples = plain(*arguments, **options)  # type: ignore[arg-type]
-        return samples.keep(torch.arange(len(samples)) % 97 != 0)
-
-    def doubling(*arguments: object, **options: object) -> Samples:
-        samples = plain(*arguments, **options)  # type: ignore[arg-type]
-        twice = torch.arange(len(samples)).repeat_interleave(1 + (torch.arange(len(samples)) % 97 == 0).long())
-        return Samples(*(getattr(samples, field.name)[twice] for field in fields(samples)))
-
-    monkeypatch.setitem(globals(), "march", losing)
-    test_random_full(within := Within())
-    assert "gap or overlap between samples, in steps" in within.missed
-    monkeypatch.setitem(globals(), "march", doubling)
-    test_random_full(within := Within())
-    assert "gap or overlap between samples, in steps" in within.missed

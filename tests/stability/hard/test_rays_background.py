@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from functools import cache
 
+import pytest
 import torch
 from hypothesis import given
 from hypothesis import strategies as st
@@ -12,7 +13,7 @@ from torch import Tensor
 from fieldfuse.render.march import MarchGrid, march
 from fieldfuse.volume.space import Space
 from fieldfuse.volume.topology import VOXELS
-from tests.stability.hard.errors import absolute, not_finite, relative
+from tests.stability.hard.errors import absolute, largest, not_finite, relative
 from tests.stability.hard.fields import lattice_grid, random_rays, unit
 from tests.stability.hard.ranges import FEW
 from tests.stability.hard.within import Within
@@ -72,35 +73,48 @@ BOUNDS = {
 }
 
 
-def test_inside_and_outside(within: Within) -> None:
-    """From inside and from outside the region."""
-    grid = lattice_grid(256, 1.0, shell=1.0)
-    origins, directions = random_rays(12, 3)
-    more, ways = random_rays(12, 4, away=0.4)
-    within.each(background_errors(grid, torch.cat([origins, more]), torch.cat([directions, ways])), others=BOUNDS)
+@cache
+def _grid() -> MarchGrid:
+    return lattice_grid(256, 1.0, shell=1.0)
 
 
-def test_axes_and_away(within: Within) -> None:
-    """Along axes and diagonals, away from the region."""
-    grid = lattice_grid(256, 1.0, shell=1.0)
+def background_grid(half: float = 1.0) -> MarchGrid:
+    """A full lattice in a region of this half size."""
+    _grid().space = Space((0.0, 0.0, 0.0), half, 1.0)
+    return _grid()
+
+
+def from_both_sides() -> dict[str, float]:
+    rays = zip(random_rays(12, 3), random_rays(12, 4, away=0.4), strict=True)
+    return background_errors(background_grid(), *(torch.cat(pair) for pair in rays))
+
+
+def along_axes() -> dict[str, float]:
     directions = unit(torch.tensor([[1.0, 0, 0], [0, -1.0, 0], [0, 0, 1.0], [1.0, 1.0, 0], [-1.0, 1.0, 1.0], [1.0, 1e-9, -1e-20]]))
-    origins = torch.cat([torch.zeros(6, 3), 0.9 * directions, -3 * directions])
-    within.each(background_errors(grid, origins, directions.repeat(3, 1)), others=BOUNDS)
+    return background_errors(background_grid(), torch.cat([torch.zeros(6, 3), 0.9 * directions, -3 * directions]), directions.repeat(3, 1))
 
 
-def test_shells(within: Within) -> None:
-    """Thin and thick shells, small and large regions, from inside."""
-    worst = dict.fromkeys(BOUNDS, 0.0)
-    for shell, half in ((0.5, 1e-3), (1.0, 1e4), (2.0, 5.0)):
-        origins, directions = random_rays(8, 7, away=0.5)
-        errors = background_errors(lattice_grid(256, 1.0, 1, half, shell), origins * half, directions, 0.05 * half)
-        worst = {name: max(worst[name], errors[name]) for name in worst}
-    within.each(worst, others=BOUNDS)
+def in_a_shell(shell: float, half: float) -> dict[str, float]:
+    origins, directions = random_rays(8, 7, away=0.5)
+    return background_errors(lattice_grid(256, 1.0, 1, half, shell), origins * half, directions, 0.05 * half)
+
+
+CASES = {
+    "from inside and from outside the region": from_both_sides,
+    "along axes and diagonals, away from the region": along_axes,
+    "thin and thick shells, small and large regions": lambda: largest(in_a_shell(*of) for of in ((0.5, 1e-3), (1.0, 1e4), (2.0, 5.0))),
+}
+
+
+@pytest.mark.parametrize("case", CASES)
+def test_rays(case: str, within: Within) -> None:
+    """Samples lie where rays pass."""
+    within.each(CASES[case](), others=BOUNDS)
 
 
 def test_far_start(within: Within) -> None:
     """Starting 5 and 10 half sizes away."""
-    grid = lattice_grid(256, 1.0, shell=1.0)
+    grid = background_grid()
     for away in (5.0, 10.0):
         origins, directions = random_rays(10, 8, away)
         samples = march(grid, origins, directions)
@@ -142,14 +156,3 @@ def test_marching_beyond_the_region(away: float, seed: int, power: float) -> Non
     errors = background_errors(background_grid(half), origins * half, directions, 0.01 * half)
     for name, bound in BOUNDS.items():
         assert errors[name] <= bound, (name, errors[name])
-
-
-@cache
-def full_grid() -> MarchGrid:
-    return lattice_grid(256, 1.0, 0, 1.0, 1.0)
-
-
-def background_grid(half: float) -> MarchGrid:
-    grid = full_grid()
-    grid.space = Space((0.0, 0.0, 0.0), half, 1.0)
-    return grid

@@ -1,5 +1,5 @@
 # mypy: disable-error-code="no-untyped-def,untyped-decorator,misc"
-"""First hits of rays on convex solids on CUDA: every ray meets every solid, in one launch (`cast.py` in tensors). Imported only there."""
+"""First hits of rays on convex solids on CUDA: every ray meets every solid, in one launch. Imported only there."""
 
 from __future__ import annotations
 

@@ -2,10 +2,23 @@
 
 from __future__ import annotations
 
+from typing import TYPE_CHECKING
+
 import triton
 import triton.language as tl
 
-from fieldfuse.backends.triton.train_rates import R_DECODER, R_DENSITY, R_FEATURE
+if TYPE_CHECKING:
+    from fieldfuse.training.losses import Rates
+
+# Where kernels find the step sizes and the weights of the losses.
+R_DENSITY, R_FEATURE, R_DECODER, R_DISTORTION, R_OPACITY, R_DEPTH, R_NOISE, R_SLOW = (tl.constexpr(v) for v in range(8))
+RATES = 8
+
+
+def rates_of(rates: Rates) -> list[float]:
+    """What kernels read of `rates`, each in its place."""
+    steps = [rates.density, rates.feature, rates.decoder]
+    return [*steps, rates.distortion, rates.opacity, rates.depth, rates.depth_noise, rates.slow_within]
 
 
 @triton.jit(do_not_specialize=["rows"])

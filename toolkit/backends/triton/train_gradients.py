@@ -27,7 +27,7 @@ from fieldfuse.backends.triton.march import (
     gathered,
     noted_at,
 )
-from fieldfuse.backends.triton.train_rates import R_DEPTH, R_DISTORTION, R_NOISE, R_OPACITY, R_SLOW
+from fieldfuse.backends.triton.train_adam import R_DEPTH, R_DISTORTION, R_NOISE, R_OPACITY, R_SLOW
 
 C_KEEP, C_REACH = tl.constexpr(KEEP), tl.constexpr(REACH)
 HUGE = tl.constexpr(3e38)  # what is not smaller is not finite

@@ -16,7 +16,6 @@ import torch.nn.functional as F
 from torch import Tensor
 
 from fieldfuse.backends import dispatch
-from fieldfuse.nerfusion import compiled, compiled_witness
 from fieldfuse.nerfusion.cameras import Cameras
 from fieldfuse.nerfusion.extras.matching import LARGE, SMALL, TEMPERATURE
 from fieldfuse.nerfusion.extras.plane_sweep import PEAK, CostVolume, DepthDistribution, to_probability
@@ -32,33 +31,28 @@ SPACING = 2  # of the pixels that are checked
 
 @dataclass(frozen=True)
 class CrossView:
-    """Evidence of one key frame for and against surface.
+    """Evidence of one key frame for and against surface, over inverse depths `lowest`, `lowest` + `step`, …"""
 
-    Attributes:
-        camera: one.
-        log_odds: (D, h, w) over inverse depths, farthest first: logarithm of how much likelier surface is than without this key frame.
-        lowest, step: inverse depth of the first entry, and between entries.
-    """
-
-    camera: Cameras
-    log_odds: Tensor
+    camera: Cameras  # one
+    log_odds: Tensor  # (D, h, w), farthest first: logarithm of how much likelier surface is than without this key frame
     lowest: float
     step: float
     _numbers: list[Tensor] = field(default_factory=list, init=False, compare=False, repr=False)
 
     def numbers(self) -> Tensor:
-        """(23,) that kernels for CUDA ask it by (`backends/triton/reading.py`), put together once."""
+        """(23,) that kernels for CUDA read it by (`backends/triton/depth_reading.py`), put together once."""
         if not self._numbers:
-            from fieldfuse.backends.triton import reading
+            from fieldfuse.backends.triton import depth_reading
 
-            self._numbers.append(reading.numbers(self.camera, self.log_odds, self.lowest, self.step))
+            self._numbers.append(depth_reading.numbers(self.camera, self.log_odds, self.lowest, self.step))
         return self._numbers[0]
 
     def log_odds_at(self, points: Tensor) -> tuple[Tensor, Tensor]:
         """(N, 3) points of the working frame → (N,) log odds, 0 outside of the image, and (N,) bool, inside of it."""
-        if compiled.fits(points, self.log_odds):
-            pose, lens = self.camera.world_from_camera[0], self.camera.lens(0)
-            return compiled_witness.ask(points, self.log_odds, pose, lens, self.lowest, self.step)
+        if dispatch.can_use_numba(points, self.log_odds):
+            from fieldfuse.backends.numba import depth_reading
+
+            return depth_reading.log_odds_at(points, self)
         local = self.camera.local(points)[0]
         seen = local[:, 2] > 1e-4
         inverse = 1 / torch.where(seen, local[:, 2], torch.ones_like(local[:, 2]))
@@ -74,9 +68,10 @@ class CrossView:
 def cross_view(distribution: DepthDistribution) -> CrossView:
     """A key frame's evidence for others, from its depth distribution."""
     if dispatch.can_use_triton(distribution.table):
-        from fieldfuse.backends.triton import reading
+        from fieldfuse.backends.triton import depth_reading
 
-        return CrossView(distribution.camera, reading.says(distribution.table, FOR, AGAINST, ABOUT), distribution.lowest, distribution.step)
+        log_odds = depth_reading.log_odds(distribution.table, FOR, AGAINST, ABOUT)
+        return CrossView(distribution.camera, log_odds, distribution.lowest, distribution.step)
     nearer = distribution.table[0].permute(1, 2, 0).contiguous()  # (h, w, D): planes of a pixel next to each other in memory
     hidden = F.pad(nearer[..., ABOUT:], (0, ABOUT))
     not_free = F.pad(nearer[..., :-ABOUT], (ABOUT, 0), value=1.0)
@@ -91,9 +86,9 @@ def confident_points(costs: CostVolume, distribution: DepthDistribution) -> Tens
     On CUDA all pixels, with points that are not numbers, which no key frame sees, for the others: their number is not read back.
     """
     if dispatch.can_use_triton(distribution.table):
-        from fieldfuse.backends.triton import reading
+        from fieldfuse.backends.triton import depth_reading
 
-        return reading.surest(distribution.table, costs.rays, costs.inverses, costs.camera.positions[0], SURE)
+        return depth_reading.confident_points(distribution.table, costs.rays, costs.inverses, costs.camera.positions[0], SURE)
     likely = torch.diff(distribution.table[0], dim=0).neg().flatten(1)  # between planes
     best = likely.argmax(0)
     middle = 0.5 * (costs.inverses[best] + costs.inverses[best + 1])
@@ -101,53 +96,53 @@ def confident_points(costs: CostVolume, distribution: DepthDistribution) -> Tens
     return places[distribution.table[2, 0].flatten() > SURE]
 
 
+@torch.no_grad()
 def own_estimate(costs: CostVolume) -> tuple[CrossView, Tensor]:
     """A key frame's `cross_view` by its own images alone, and its `confident_points`."""
     if costs.empty is None and dispatch.can_use_triton(costs.cost):
-        return _alone_on_device(costs)
+        from fieldfuse.backends.triton import plane_sweep
+
+        weights = (SMALL, LARGE, TEMPERATURE), PEAK, (FOR, AGAINST, ABOUT), SURE
+        log_odds, surface, numbers = plane_sweep.own_estimate(costs, *weights)
+        one = CrossView(costs.camera, log_odds, costs.lowest, costs.step)
+        one._numbers.append(numbers)
+        return one, surface
     distribution = to_probability(costs)
     return cross_view(distribution), confident_points(costs, distribution)
 
 
-@torch.no_grad()
-def _alone_on_device(costs: CostVolume) -> tuple[CrossView, Tensor]:
-    from fieldfuse.backends.triton import matching
-
-    weights = (SMALL, LARGE, TEMPERATURE), PEAK, (FOR, AGAINST, ABOUT), SURE
-    given = costs.cost, costs.rays, costs.inverses, costs.camera, costs.lowest, costs.step
-    log_odds, surface, numbers = matching.alone(*given, *weights)
-    one = CrossView(costs.camera, log_odds, costs.lowest, costs.step)
-    one._numbers.append(numbers)
-    return one, surface
-
-
 def reliability(one: CrossView, surface: Tensor) -> float:
     """In [0, 1]: how much a key frame counts, by its log odds at another one's `confident_points` (N, 3); 1 if it sees none of them."""
-    correction, seen = one.log_odds_at(surface)
+    odds, seen = one.log_odds_at(surface)
     count = int(seen.sum())
-    return 1.0 if count == 0 else min(1.0, max(0.0, float(correction.sum()) / count / BELIEVED))
+    return 1.0 if count == 0 else min(1.0, max(0.0, float(odds.sum()) / count / BELIEVED))
 
 
 @torch.no_grad()
 def consistency(costs: CostVolume, others: Sequence[CrossView], surface: Tensor | None = None) -> Tensor | None:
     """(D, h, w) that `to_probability` subtracts from the cost, in any order of the other key frames; None without any.
 
+    They are read at every `SPACING`-th pixel; between planes nothing can be skipped, surfaces are thinner.
+
     Args:
         surface: (N, 3) `confident_points` of `costs` alone. Another key frame counts as far as it confirms them on average: where poses
             are off, key frames look through each other's surfaces. None: all count in full.
-
-    They are read at every `SPACING`-th pixel either way; between planes nothing can be left out, surfaces are thinner.
     """
     if not others:
         return None
-    planes, height, width = costs.cost.shape
-    coarse = [-(-side // SPACING) for side in (height, width)]
+    _, height, width = costs.cost.shape
+    coarse = -(-height // SPACING), -(-width // SPACING)
     if dispatch.can_use_triton(costs.rays, *[one.log_odds for one in others]):
-        mean = _mean_on_device(costs, (height, width), (coarse[0], coarse[1]), others, surface)
-        return F.interpolate(mean[None].permute(0, 3, 1, 2), (height, width), mode="bilinear")[0]
-    rays = F.interpolate(costs.rays.T.view(1, 3, height, width), coarse, mode="bilinear").view(3, -1).T.contiguous()
-    mean = SHARE * _mean(rays, costs.inverses, costs.camera.positions[0], others, surface)
-    return F.interpolate(mean.view(1, *coarse, planes).permute(0, 3, 1, 2), (height, width), mode="bilinear")[0]
+        from fieldfuse.backends.triton import depth_reading
+
+        # Reliabilities stay on the device, which nobody waits for.
+        together = depth_reading.Together(others)
+        sums = None if surface is None else together.confirmed(surface)
+        mean = together.mean(costs, coarse, sums, BELIEVED, SHARE)
+    else:
+        rays = F.interpolate(costs.rays.T.view(1, 3, height, width), coarse, mode="bilinear").view(3, -1).T.contiguous()
+        mean = SHARE * _mean(rays, costs.inverses, costs.camera.positions[0], others, surface).view(*coarse, -1)
+    return F.interpolate(mean[None].permute(0, 3, 1, 2), (height, width), mode="bilinear")[0]
 
 
 def all_consistent(volumes: Sequence[CostVolume]) -> list[DepthDistribution]:
@@ -162,27 +157,14 @@ def all_consistent(volumes: Sequence[CostVolume]) -> list[DepthDistribution]:
 
 def _mean(rays: Tensor, inverses: Tensor, origin: Tensor, others: Sequence[CrossView], surface: Tensor | None) -> Tensor:
     """(P, D) mean log odds of those that see there, each by its `reliability`, along rays (P, 3) at inverse depths (D,)."""
-    volumes = [one.log_odds for one in others]
-    beliefs = [1.0 if surface is None else reliability(one, surface) for one in others]
-    if compiled.fits(rays, inverses, *volumes):
-        asked = compiled_witness.Question(rays, inverses, origin)
-        for one, belief in zip(others, beliefs, strict=True):
-            asked.put(one.log_odds, one.camera.world_from_camera[0], one.camera.lens(0), one.lowest, one.step, belief)
-        return asked.mean()
+    reliabilities = [1.0 if surface is None else reliability(one, surface) for one in others]
+    if dispatch.can_use_numba(rays, inverses, *[one.log_odds for one in others]):
+        from fieldfuse.backends.numba import depth_reading
+
+        return depth_reading.mean_log_odds(rays, inverses, origin, others, reliabilities)
     points = (rays[:, None] / inverses[:, None] + origin).reshape(-1, 3)
     total, count = torch.zeros_like(points[:, 0]), torch.zeros_like(points[:, 0])
-    for one, belief in zip(others, beliefs, strict=True):
-        correction, seen = one.log_odds_at(points)
-        total, count = total + belief * correction, count + seen
+    for one, share in zip(others, reliabilities, strict=True):
+        odds, seen = one.log_odds_at(points)
+        total, count = total + share * odds, count + seen
     return (total / count.clamp_min(1)).view(len(rays), -1)
-
-
-def _mean_on_device(
-    costs: CostVolume, grid: tuple[int, int], coarse: tuple[int, int], others: Sequence[CrossView], surface: Tensor | None
-) -> Tensor:
-    """(h', w', D): a share of the mean, without waiting for CUDA: reliabilities stay there."""
-    from fieldfuse.backends.triton import reading
-
-    asked = reading.Asked(others)
-    sums = None if surface is None else asked.confirmed(surface)
-    return asked.mean(costs.rays, costs.inverses, costs.camera, grid, coarse, sums, BELIEVED, SHARE)

@@ -7,7 +7,7 @@ for those that need them next. Images are compared small, which costs little aga
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 
 import numpy as np
 import torch
@@ -15,20 +15,19 @@ from torch import Tensor
 
 from fieldfuse.backends.dispatch import is_cpu
 from fieldfuse.camera import Array, Intrinsics
-from fieldfuse.capture.types import Views
 from fieldfuse.nerfusion.cameras import Cameras
 from fieldfuse.nerfusion.extras.cross_view_consistency import CrossView, consistency, cross_view, own_estimate
 from fieldfuse.nerfusion.extras.matching import patch_descriptors
 from fieldfuse.nerfusion.extras.plane_sweep import CostVolume, DepthDistribution, cost_volume, to_probability
-from fieldfuse.nerfusion.images import Recent, image_of, sensor_depth, with_neighbours
+from fieldfuse.nerfusion.images import ImageCache, Recent
 from fieldfuse.nerfusion.keyframes import KeyFrames
 from fieldfuse.poses.overlap import overlap, parallax
 
 MOST = 8  # key frames that one is checked against
 LEAST_OVERLAP = 0.1  # either way
 WIDEST = 60.0  # degrees of parallax: two that see a place from opposite sides tell little about each other
-KEPT = 32  # distributions cached for key frames to come, 13 MB each at most, and as much again until they are needed
-KEPT_DESCRIPTORS = 16  # images, 6 MB each at most
+CACHED = 32  # distributions for key frames to come, 13 MB each at most, and as much again until they are needed
+CACHED_DESCRIPTORS = 16  # images, 6 MB each at most
 
 
 def overlapping(keys: KeyFrames, world_from_camera: Array, intrinsics: Sequence[Intrinsics], depth: float) -> list[list[int]]:
@@ -49,62 +48,43 @@ def overlapping(keys: KeyFrames, world_from_camera: Array, intrinsics: Sequence[
 
 
 class KeyframeDepth:
-    """Call with a position in `keys.indices` for the depth distribution of that key frame."""
+    """Call with a position in `keys.indices` for the depth distribution of that key frame.
 
-    def __init__(
-        self,
-        views: Views,
-        keys: KeyFrames,
-        witnesses: Sequence[Sequence[int]],
-        near: float,
-        far: float,
-        measured: bool = False,
-        device: torch.device | str = "cpu",
-        pictures: Callable[[int], Tensor] | None = None,
-    ) -> None:
-        """
-        Args:
-            witnesses: for each key frame those that it is checked against, as `overlapping` gives them; none: its own images alone.
-            near, far: depths along z, working units; one of them known.
-            measured: the depth that a sensor measured goes into a key frame's distribution.
-            pictures: gives a view's image (1, 3, H, W) on the device; None: it is brought there.
+    Args:
+        images: of the views that `keys` counts, and their measured depth.
+        others: for each key frame those that it is checked against, as `overlapping` gives them; none: its own images alone.
+        near, far: depths along z, working units; one of them known.
 
-        Raises:
-            ValueError: neither depth is known.
-        """
+    Raises:
+        ValueError: neither depth is known.
+    """
+
+    def __init__(self, images: ImageCache, keys: KeyFrames, others: Sequence[Sequence[int]], near: float, far: float) -> None:
         if not (near > 0 or math.isfinite(far)):
             raise ValueError("sweeps need a nearest or a farthest depth")
-        self.views, self.keys, self.witnesses = views, keys, witnesses
-        self.near, self.far, self.measured, self.device = near, far, measured, device
-        self._picture = pictures or (lambda index: image_of(views, index, device))
-        self._described: Recent[Tensor] = Recent(KEPT_DESCRIPTORS)
-        self._made: Recent[tuple[CostVolume | None, CrossView, Tensor]] = Recent(KEPT)
+        self.images, self.keys, self.others, self.near, self.far = images, keys, others, near, far
+        self._descriptors: Recent[Tensor] = Recent(CACHED_DESCRIPTORS)
+        self._made: Recent[tuple[CostVolume | None, CrossView, Tensor]] = Recent(CACHED)
 
     def __call__(self, at: int) -> DepthDistribution:
         costs, log_odds, surface = self._made.get(at, self._make)
         if costs is None:
             costs, log_odds, surface = self._make(at)
-        correction = consistency(costs, [self._made.get(other, self._make)[1] for other in self.witnesses[at]], surface)
+        correction = consistency(costs, [self._made.get(other, self._make)[1] for other in self.others[at]], surface)
         self._made.put(at, (None, log_odds, surface))  # a key frame is fused once, and then only checks others
-        return to_probability(costs, self._depth(at), correction)
+        return to_probability(costs, self.images.depth(int(self.keys.indices[at])), correction)
 
     def _make(self, at: int) -> tuple[CostVolume, CrossView, Tensor]:
         """The cost volume of its images, its evidence for others, and its confident points."""
-        group = with_neighbours(int(self.keys.indices[at]), self.keys.neighbours[at])
-        poses = self.views.world_from_camera[group]
-        cameras = Cameras.of([self.views.intrinsics[index] for index in group], poses, self.device)
-        new = [index for index in group if index not in self._described]
-        if len(new) > 1 and not is_cpu(torch.device(self.device)) and len({self.views.images[index].shape for index in new}) == 1:
+        views, device, group = self.images.views, self.images.device, self.keys.group(at)
+        cameras = Cameras.of([views.intrinsics[index] for index in group], views.world_from_camera[group], device)
+        new = [index for index in group if index not in self._descriptors]
+        if len(new) > 1 and not is_cpu(device) and len({views.images[index].shape for index in new}) == 1:
             # Together they take as many launches as one.
-            for index, made in zip(new, patch_descriptors(torch.cat([self._picture(index) for index in new])), strict=True):
-                self._described.put(index, made)
-        costs = cost_volume([self._described.get(index, self._describe) for index in group], cameras, self.near, self.far)
+            for index, made in zip(new, patch_descriptors(torch.cat([self.images(index) for index in new])), strict=True):
+                self._descriptors.put(index, made)
+        descriptors = [self._descriptors.get(index, lambda index: patch_descriptors(self.images(index))[0]) for index in group]
+        costs = cost_volume(descriptors, cameras, self.near, self.far)
         log_odds, surface = own_estimate(costs)
-        depth = self._depth(at)
+        depth = self.images.depth(group[0])
         return costs, log_odds if depth is None else cross_view(to_probability(costs, depth)), surface
-
-    def _describe(self, index: int) -> Tensor:
-        return patch_descriptors(self._picture(index))[0]
-
-    def _depth(self, at: int) -> Tensor | None:
-        return sensor_depth(self.views, int(self.keys.indices[at]), self.device) if self.measured else None

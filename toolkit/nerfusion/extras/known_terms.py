@@ -1,6 +1,8 @@
 """What latents start from, and what a local volume weighs (not in the paper): mean colour and expected distance to the surface.
 
-Networks learn what to change of these terms. Without them colours alone do not find surfaces: a fog of mean colours is a minimum, too.
+Networks learn what to change of these terms, within bounds. Without the terms colours alone do not find surfaces: a fog of mean colours is
+a minimum, too. Without the bounds networks paint images right before the cameras of key frames, which explains neighbouring views just as
+well as surfaces.
 """
 
 from __future__ import annotations
@@ -10,7 +12,7 @@ from functools import lru_cache
 import torch
 from torch import Tensor
 
-from fieldfuse.backends.constants import INSIDE
+from fieldfuse.backends.constants import CHANGE, INSIDE
 from fieldfuse.nerfusion.extras.plane_sweep import SdfEstimate
 from fieldfuse.volume.topology import VOXELS, Topology
 
@@ -51,12 +53,22 @@ def blocks_near_surface(topology: Topology, rows: Tensor, starts: Tensor) -> Ten
     """
     active = torch.zeros(topology.blocks + 1, dtype=torch.bool, device=topology.device)
     slots = rows.div(VOXELS, rounding_mode="floor")
-    near = starts[:, INSIDE] > _latent_of(FREE)
+    near = starts[:, INSIDE] > _free_latent()
     # One more block takes those that are free: to choose the others would be to wait for the device.
     return active.index_fill(0, torch.where(near, slots, topology.blocks), True)[:-1]
 
 
-@lru_cache(maxsize=4)
-def _latent_of(signed: float) -> float:
-    """`sdf_latent` of one number, rounded as a tensor's."""
-    return float(sdf_latent(torch.tensor([signed])))
+@lru_cache(maxsize=1)
+def _free_latent() -> float:
+    """`sdf_latent` of `FREE`, rounded as a tensor's."""
+    return float(sdf_latent(torch.tensor([FREE])))
+
+
+def soft_bound(learned: Tensor, most: float) -> Tensor:
+    """What is learned, within ± `most` without a kink."""
+    return most * torch.tanh(learned / most)
+
+
+def bounded(learned: Tensor) -> Tensor:
+    """(N, channels) learned additions to a latent; that to the distance behind the surface stays within ± `CHANGE`."""
+    return torch.cat([learned[:, :INSIDE], soft_bound(learned[:, INSIDE : INSIDE + 1], CHANGE), learned[:, INSIDE + 1 :]], 1)

@@ -1,4 +1,4 @@
-"""What pictures are compared by, and semi-global matching: from costs of depths to a distribution over depths, pixel by pixel.
+"""What images are compared by, and semi-global matching: from costs of depths to a distribution over depths, pixel by pixel.
 
 Two descriptors go together: colours tell where surfaces of one colour end but change with exposure; patches without their mean and contrast
 do not. Nothing here is learned or differentiated.
@@ -6,14 +6,16 @@ do not. Nothing here is learned or differentiated.
 
 from __future__ import annotations
 
+import numpy as np
 import torch
 import torch.nn.functional as F
 from torch import Tensor
 
 from fieldfuse.backends import dispatch
-from fieldfuse.nerfusion import compiled
+from fieldfuse.stereo.cost_volume import DOWN, STRAIGHT, UP, summed_paths
+from fieldfuse.threads import share
 
-SIDE = 256  # pixels of the long side at which pictures are compared (docs/measured/few_views.md) …
+SIDE = 256  # pixels of the long side at which images are compared (docs/measured/few_views.md) …
 SIDE_WITHIN = 448  # … and where silhouettes leave a part of them
 CONTRAST = 0.03  # of a patch, added to its own: what is flatter is noise
 GREY = (0.3, 0.59, 0.11)
@@ -31,9 +33,9 @@ def patch_descriptors(images: Tensor, side: int = SIDE) -> Tensor:
         size = [max(1, round(length * side / long)) for length in images.shape[-2:]]
         images = F.interpolate(images, size, mode="bilinear", antialias=True)
     if dispatch.can_use_triton(images):
-        from fieldfuse.backends.triton import describe as kernels
+        from fieldfuse.backends.triton import plane_sweep
 
-        return kernels.describe(images, GREY, CONTRAST)
+        return plane_sweep.patch_descriptors(images, GREY, CONTRAST)
     red, green, blue = images.split(1, 1)
     grey = GREY[0] * red + GREY[1] * green + GREY[2] * blue
     return torch.cat([images, _patches(grey, 1), _patches(grey, 2)], 1)
@@ -70,13 +72,16 @@ def together(costs: Tensor, visible: Tensor) -> Tensor:
 
 def semi_global(cost: Tensor) -> Tensor:
     """(D, h, w) costs → the same smoothed along four directions, each the cheapest path up to the pixel (semi-global matching)."""
-    if compiled.fits(cost) and len(cost) > 2:
-        return compiled.semi_global(cost, SMALL, LARGE)
-    if dispatch.can_use_triton(cost):
-        from fieldfuse.backends.triton import matching
-
-        return matching.semi_global(cost, SMALL, LARGE)
     volume = cost.permute(1, 2, 0)  # (h, w, D)
+    if dispatch.can_use_numba(cost) and len(cost) > 2:
+        whole = volume.contiguous().numpy()
+        even = np.zeros(whole.shape[:2], np.float32)  # depth may step anywhere
+        one, other = share(lambda way: summed_paths(whole, even, SMALL, LARGE, STRAIGHT, (way,)), (DOWN, UP), torch.get_num_threads())
+        return torch.from_numpy((one + other) / np.float32(4)).permute(2, 0, 1)
+    if dispatch.can_use_triton(cost):
+        from fieldfuse.backends.triton import plane_sweep
+
+        return plane_sweep.semi_global(cost, SMALL, LARGE)
     down, right = volume, volume.transpose(0, 1)
     total = _paths(down) + _paths(down.flip(0)).flip(0)
     total = total + (_paths(right) + _paths(right.flip(0)).flip(0)).transpose(0, 1)
@@ -98,8 +103,8 @@ def _paths(volume: Tensor) -> Tensor:
 def smoothed_softmax(cost: Tensor) -> Tensor:
     """(D, h, w) costs → how likely the surface lies at each plane; sums to one over D."""
     if dispatch.can_use_triton(cost):
-        from fieldfuse.backends.triton import matching
+        from fieldfuse.backends.triton import plane_sweep
 
-        return matching.distribution(cost, SMALL, LARGE, TEMPERATURE)
+        return plane_sweep.smoothed_softmax(cost, SMALL, LARGE, TEMPERATURE)
     along = semi_global(cost).permute(1, 2, 0)  # (h, w, D), where the planes of a pixel lie next to each other in memory on the CPU
     return torch.softmax(along.div_(-TEMPERATURE), 2).permute(2, 0, 1)

@@ -6,22 +6,24 @@ import csv
 import math
 from collections.abc import Sequence
 from pathlib import Path
+from typing import Any
 
+import numpy as np
+import torch
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 from matplotlib.ticker import MaxNLocator
+from torch import Tensor, nn
 
 from fieldfuse.errors import InputError, first_line
 from fieldfuse.files import atomic_path
+from fieldfuse.nerfusion.gru import FusionGRU
+from fieldfuse.nerfusion.model import NerfusionModel
 
-# Panels of the picture: title, columns drawn in it (a column that no row has is left out), and whether the axis is logarithmic.
+# Panels of the image: title, columns drawn in it (a column that no row has is left out), and whether the axis is logarithmic.
 PANELS: tuple[tuple[str, tuple[str, ...], bool], ...] = (
     ("PSNR (dB)", ("psnr_local", "psnr_fused", "psnr_fused_1"), False),
-    (
-        "PSNR on held-out pictures of real captures (dB)",
-        ("val_psnr_local", "val_psnr_fused", "val_psnr_fused_1", "val_psnr_nearest"),
-        False,
-    ),
+    ("PSNR on held-out images of real captures (dB)", tuple(f"val_psnr_{n}" for n in ("local", "fused", "fused_1", "nearest")), False),
     ("log likelihood of the true depth", ("depth_likelihood", "val_depth_likelihood"), False),
     ("relative depth error (median)", ("depth_error", "val_depth_error"), False),
     ("spatial deviation of encoder features", ("feature_deviation",), False),
@@ -73,16 +75,48 @@ class Curve:
         draw_curve(self.rows, self.picture)
 
 
+class GateWatch:
+    """Shares of saturated values of the fusion's update and reset gates, read from the running GRU by hooks, without touching it.
+
+    The update gate's known part (how many key frames a voxel was in) is not counted: what is watched is what was learned.
+    """
+
+    def __init__(self, model: NerfusionModel) -> None:
+        self.on = False
+        self._seen: dict[str, list[float]] = {}
+        if isinstance(model.fusion, FusionGRU):
+            for name in ("update", "reset"):
+                getattr(model.fusion, name).register_forward_hook(self._hook(f"gate_{name}_saturated"))
+
+    def _hook(self, name: str) -> Any:
+        def look(_module: nn.Module, inputs: tuple[Any, ...], output: Tensor) -> None:
+            if self.on:
+                inside = inputs[2]
+                values = output.detach()[: len(inside)][inside]
+                self._seen.setdefault(name, []).append(saturation(torch.sigmoid(values)))
+
+        return look
+
+    def shares(self) -> dict[str, float]:
+        """Means since the last call; empty when no gate was used."""
+        seen, self._seen = self._seen, {}
+        return {name: sum(values) / len(values) for name, values in seen.items()}
+
+
+def saturation(gate: Tensor) -> float:
+    """Share of a gate's values within 0.01 of 0 or 1."""
+    return float(((gate < 0.01) | (gate > 0.99)).float().mean()) if gate.numel() else 0.0
+
+
 def smoothed(values: Sequence[float], window: int = SMOOTH) -> list[float]:
     """Trailing mean over up to `window` values; as many values as came in."""
-    out, total = [], 0.0
-    for i, value in enumerate(values):
-        total += value - (values[i - window] if i >= window else 0.0)
-        out.append(total / min(i + 1, window))
-    return out
+    sums = np.concatenate([[0.0], np.cumsum(np.asarray(values, dtype=np.float64))])
+    ends = np.arange(1, len(sums))
+    starts = np.maximum(ends - window, 0)
+    return ((sums[ends] - sums[starts]) / (ends - starts)).tolist()  # type: ignore[no-any-return]
 
 
-def draw_curve(rows: Sequence[dict[str, float]], path: Path, stage_two: float | None = None) -> None:
+def draw_curve(rows: Sequence[dict[str, float]], path: Path) -> None:
     """Draw all panels that have data, as a PNG.
 
     Raises:
@@ -93,8 +127,7 @@ def draw_curve(rows: Sequence[dict[str, float]], path: Path, stage_two: float | 
     lines = -(-len(panels) // 2)
     figure = Figure(figsize=(10, 2.5 * lines), layout="constrained")
     FigureCanvasAgg(figure)
-    if stage_two is None:
-        stage_two = next((row["step"] for row in rows if row.get("stage") == 2.0), None)
+    stage_two = next((row["step"] for row in rows if row.get("stage") == 2.0), None)
     for number, (title, columns, logarithmic) in enumerate(panels):
         axes = figure.add_subplot(lines, 2, number + 1)
         for column in columns:

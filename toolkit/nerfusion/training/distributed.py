@@ -6,6 +6,7 @@ import os
 from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, field
+from typing import Any
 
 import torch
 import torch.distributed as dist
@@ -27,7 +28,7 @@ class Crew:
         return self.rank == 0
 
     @property
-    def meeting(self) -> torch.device:
+    def exchange_device(self) -> torch.device:
         """Where numbers lie that the processes exchange: nccl takes those of a device, gloo the processor's."""
         return self.device if dist.get_backend() == "nccl" else torch.device("cpu")
 
@@ -37,7 +38,7 @@ class Crew:
             return
         parameters = [p for p in parameters if p.requires_grad]
         flat = torch.cat([(p.grad if p.grad is not None else torch.zeros_like(p)).reshape(-1).float() for p in parameters])
-        shared = flat.to(self.meeting)
+        shared = flat.to(self.exchange_device)
         dist.all_reduce(shared)
         flat = shared.to(flat.device).div_(self.size)
         for p, part in zip(parameters, flat.split([p.numel() for p in parameters]), strict=True):
@@ -47,7 +48,7 @@ class Crew:
         """Whether the flag is set in any process."""
         if self.size == 1:
             return flag
-        value = torch.tensor([float(flag)], device=self.meeting)
+        value = torch.tensor([float(flag)], device=self.exchange_device)
         dist.all_reduce(value, dist.ReduceOp.MAX)
         return bool(value.item())
 
@@ -55,14 +56,10 @@ class Crew:
         """Mean of each number over the processes that have it."""
         if self.size == 1:
             return values
-        gathered: list[dict[str, float] | None] = [None] * self.size
+        gathered: list[Any] = [None] * self.size
         dist.all_gather_object(gathered, values)
-        keys = dict.fromkeys(key for one in gathered if one for key in one)
-        out = {}
-        for key in keys:
-            present = [one[key] for one in gathered if one and key in one]
-            out[key] = sum(present) / len(present)
-        return out
+        present = {key: [one[key] for one in gathered if key in one] for key in dict.fromkeys(key for one in gathered for key in one)}
+        return {key: sum(found) / len(found) for key, found in present.items()}
 
     def wait(self) -> None:
         """Until all processes are here."""
@@ -72,7 +69,7 @@ class Crew:
 
 @contextmanager
 def join_crew(device: str = "auto") -> Iterator[Crew]:
-    """The crew that `torchrun` started (its environment variables tell), or a crew of one.
+    """The crew that `torchrun` started (by its environment variables), or a crew of one.
 
     nccl between CUDA devices; gloo between CPUs, and where a machine's processes share its devices, which nccl refuses.
 

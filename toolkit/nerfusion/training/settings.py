@@ -13,7 +13,7 @@ from pydantic import Field
 from fieldfuse.config import NotNegative, Positive, PositiveNumber, Share, checked, flat, one_of, put, read_yaml
 from fieldfuse.errors import InputError, brief
 
-LEAST_SIDE = 16  # pixels; sides are rounded to multiples of 8, and less than one would be no picture
+LEAST_SIDE = 16  # pixels; sides are rounded to multiples of 8, and less than one would be no image
 KINDS = ("procedural", "shards", "scannet", "dtu", "scanned_objects", "synthetic")
 Bounds = Annotated[list[float], Field(min_length=2, max_length=2)]
 Part = Annotated[float, Field(ge=0, lt=1)]
@@ -34,10 +34,10 @@ class PictureSettings:
     """Pictures of a sample; each range is drawn from once a sample."""
 
     long_side: Annotated[list[int], Field(min_length=2, max_length=2)] = default(default_factory=lambda: [96, 160])  # pixels
-    views: Positive = 3  # K: the pictures behind one local volume
+    views: Positive = 3  # K: the images behind one local volume
     key_frames: Positive = 3  # key frames fused in stage 2
-    targets: Positive = 2  # pictures rendered for the loss
-    frames: int = 24  # pictures along a procedural path (only those that are used are drawn)
+    targets: Positive = 2  # images rendered for the loss
+    frames: int = 24  # images along a procedural path (only those that are used are drawn)
 
 
 @dataclass
@@ -69,7 +69,7 @@ class StageSettings:
     gamma: float = 0.95  # coarse cells in which exp(−optical thickness) exceeds this are not looked at finer
     most_split: Positive = 6000  # coarse cells that are looked at finer, a key frame at most
     prune_from: float = 0.5  # share of stage 2 after which the fused volume is pruned
-    witnesses: bool = False  # stage 2 and validation: key frames of a sample are each other's witnesses, as in direct inference
+    witnesses: bool = False  # stage 2 and validation: key frames of a sample are checked against each other, as in direct inference
 
 
 @dataclass
@@ -92,13 +92,13 @@ class RecordSettings:
     validate_every: Positive = 500
     keep: Positive = 2  # checkpoints
     captures: list[str] = default(default_factory=list)  # folders of real captures to validate on; never trained on
-    validation_views: int = 6  # held-out pictures a capture
+    validation_views: int = 6  # held-out images a capture
     validation_side: int = 128  # pixels
 
 
 @dataclass
 class TrainSettings:
-    """Everything that a training run can be told."""
+    """All settings of a training run."""
 
     seed: int = 0
     device: str = "auto"
@@ -164,8 +164,3 @@ def _check(settings: TrainSettings) -> None:
         raise InputError(f"pictures.long_side begins at {settings.pictures.long_side[0]} pixels; at least {LEAST_SIDE} are needed")
     if settings.total_steps < 1:
         raise InputError("stage.steps and stage.fused_steps are both 0; at least one step is needed")
-
-
-def train_settings_dict(settings: TrainSettings) -> dict[str, Any]:
-    """Plain data of all settings, kept in checkpoints."""
-    return asdict(settings)

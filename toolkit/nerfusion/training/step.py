@@ -3,25 +3,36 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 
 import torch
+from torch import Tensor
 
-from fieldfuse.backends.dispatch import to_device_async
+from fieldfuse.nerfusion.cameras import Cameras
 from fieldfuse.nerfusion.extras.matching import SIDE
-from fieldfuse.nerfusion.lattice import LatentVolume, Lattice, LocalVolume
-from fieldfuse.nerfusion.losses import Traced, annealed, rendering_loss
+from fieldfuse.nerfusion.extras.plane_sweep import DepthDistribution, sweep_planes
+from fieldfuse.nerfusion.extras.two_lattices import allowed_cells, surface_cells
+from fieldfuse.nerfusion.fusion import fuse_key_frame
+from fieldfuse.nerfusion.lattice import LatentVolume, Lattice, LocalVolume, cells
 from fieldfuse.nerfusion.model import NerfusionModel
-from fieldfuse.nerfusion.training.health import feature_deviation, rendering_health
-from fieldfuse.nerfusion.training.rays import TargetRays, in_sight, random_rays
-from fieldfuse.nerfusion.training.recurrence import Recurrence
-from fieldfuse.nerfusion.training.samples import Pictures, Sample, cameras_of, keyframe_distributions
+from fieldfuse.nerfusion.store import ValueStore
+from fieldfuse.nerfusion.training.rendering import (
+    annealed,
+    background_of,
+    feature_deviation,
+    in_sight,
+    random_rays,
+    rendering_health,
+    rendering_loss,
+    trace,
+)
+from fieldfuse.nerfusion.training.samples import Sample, keyframe_distributions
 from fieldfuse.nerfusion.training.settings import TrainSettings
-from fieldfuse.nerfusion.training.tracing import trace
+from fieldfuse.nerfusion.unproject import EncodedView, KeyFrame
+from fieldfuse.render.field import Field
 from fieldfuse.render.fused import GAMMA, make_field
 
-Tensor = torch.Tensor
 LOCAL, FUSED = "local", "fused"
 
 
@@ -33,65 +44,72 @@ class Outcome:
     numbers: dict[str, list[Tensor]] = field(default_factory=dict)
 
     def note(self, values: Mapping[str, Tensor]) -> None:
+        """Add one value of some numbers."""
         for name, value in values.items():
-            self.numbers.setdefault(name, []).append(value)
+            self.numbers.setdefault(name, []).append(value.detach().double())
 
     def means(self) -> dict[str, float]:
-        """Each number's mean over where it is one, asked of the device all at once."""
-        noted = [value.detach().double() for values in self.numbers.values() for value in values]
-        if not noted:
+        """Each number's mean over where it is one, read from the device all at once."""
+        if not self.numbers:
             return {}
-        answers = iter(torch.stack(noted).tolist())
-        out = {}
-        for name, values in self.numbers.items():
-            known = [answer for answer in (next(answers) for _ in values) if not math.isnan(answer)]
-            if known:
-                out[name] = sum(known) / len(known)
-        return out
+        means = torch.stack([torch.stack(values).nanmean() for values in self.numbers.values()]).tolist()
+        return {name: mean for name, mean in zip(self.numbers, means, strict=True) if not math.isnan(mean)}
 
 
-def background_of(pictures: Pictures, count: int, generator: torch.Generator | None) -> Tensor:
-    """(3,) or (count, 3) colour behind everything.
+class Recurrence:
+    """The loop over a sample's key frames, with global volumes as ordinary values through which gradients flow.
 
-    Where every ray meets something it is random for each ray, so that nothing cannot stand in for a surface; grey without a generator.
+    What is taken over from a coarser level is not differentiated: each level has its own loss.
+
+    Args:
+        levels: lattices, each of half the voxel size of the one before; the sample's own first.
+        gamma: coarse cells in which exp(−optical thickness) exceeds this are not looked at finer.
+        most: coarse cells that are split a key frame at most; when more are solid, the thickest ones are.
+
+    Attributes:
+        volumes: the global volumes so far, coarsest first.
     """
-    device = pictures.images.device
-    if pictures.background is not None:
-        return torch.tensor(pictures.background, device=device)
-    if generator is None:
-        return torch.full((3,), 0.5, device=device)
-    return to_device_async(torch.rand(count, 3, generator=generator).numpy(), device)
 
+    def __init__(self, model: NerfusionModel, sample: Sample, levels: int, gamma: float = 0.95, most: int = 6000) -> None:
+        self.model, self.near, self.far, self.gamma, self.most = model, sample.near, sample.far, gamma, most
+        lattice = Lattice(sample.space, sample.resolution)
+        self.volumes: list[LatentVolume] = []
+        for _ in range(levels):
+            self.volumes.append(model.start(lattice))
+            lattice = lattice.finer()
 
-def local_of(model: NerfusionModel, sample: Sample, frame: int, log: Outcome | None = None) -> LocalVolume:
-    """The local volume of key frame `frame` of a sample."""
-    indices = sample.references[frame]
-    cameras = cameras_of(sample.pictures, indices)
-    views = model.encode(sample.pictures.images[indices], cameras)
-    if log is not None:
-        log.note({"feature_deviation": encoder_deviation(model, sample.pictures.images[indices[:1]])})
-    return model.local_volume(views, cameras, Lattice(sample.space, sample.resolution), near=sample.near, far=sample.far)
+    def add(self, views: Sequence[EncodedView], cameras: Cameras, distribution: DepthDistribution | None = None) -> LocalVolume:
+        """Fuse one more key frame; answers its local volume on the coarsest lattice. `distribution`: of its depth; None: made here."""
+        if distribution is None:
+            distribution = sweep_planes([view.descriptors for view in views], cameras, self.near, self.far)
+        stores = [ValueStore(volume) for volume in self.volumes]
+        local = fuse_key_frame(self.model, KeyFrame(views, cameras, self.near, self.far, distribution), stores, None, self._finer_cells)
+        self.volumes = [store.volume() for store in stores]
+        return local
 
+    @torch.no_grad()
+    def _finer_cells(self, part: LatentVolume, seen: Tensor) -> Tensor:
+        """(M · 512,) bool, cells that are looked at finer."""
+        thickness = self.model.thickness(part)
+        kept = surface_cells(part, seen, thickness, self.gamma)
+        if int(kept.sum()) > self.most:
+            # A cell is as thick as its thickest corner; the threshold that leaves `most` of them is that quantile of its values.
+            values = torch.where(part.known, thickness[:-1], torch.full_like(thickness[:-1], -torch.inf))
+            level = torch.topk(values, min(self.most // 4, len(values))).values[-1]
+            kept &= cells(part.topology, part.known & (values >= level), every=False)
+        return kept
 
-@torch.no_grad()
-def encoder_deviation(model: NerfusionModel, images: Tensor) -> Tensor:
-    """Spatial deviation of the encoder's features on these pictures."""
-    return feature_deviation(model.encoder(images))
+    @torch.no_grad()
+    def allowed(self, level: int) -> Tensor | None:
+        """(M · 512,) bool, cells of a level's volume whose coarser ones are not see-through; None: all (the coarsest level)."""
+        if level == 0:
+            return None
+        coarse = self.volumes[level - 1]
+        return allowed_cells(coarse, self.model.thickness(coarse), self.gamma, self.volumes[level].topology)
 
-
-def render_volume(
-    model: NerfusionModel,
-    volume: LatentVolume,
-    rays: TargetRays,
-    behind: Tensor,
-    near: float,
-    generator: torch.Generator | None,
-    prune: bool,
-    allowed: Tensor | None = None,
-) -> Traced:
-    """Render a local or global volume along rays, with gradients where they are enabled."""
-    made = make_field(model, volume, behind if behind.ndim == 1 else behind[0], gamma=GAMMA if prune else None, near=near, allowed=allowed)
-    return trace(made, rays, behind, generator)
+    def detach(self) -> None:
+        """Cut the volumes off from the graph (truncated back-propagation)."""
+        self.volumes = [volume.detached() for volume in self.volumes]
 
 
 class Stepper:
@@ -110,76 +128,92 @@ class Stepper:
         stage = self.settings.stage
         return step >= stage.steps + stage.prune_from * stage.fused_steps
 
-    def _loss(
-        self,
-        volume: LatentVolume,
-        sample: Sample,
-        targets: Tensor,
-        references: Tensor,
-        count: int,
-        which: str,
-        step: int,
-        generator: torch.Generator,
-        log: Outcome,
-        allowed: Tensor | None = None,
-    ) -> Tensor:
-        rays = random_rays(sample.pictures, targets, count, generator)
-        kept = in_sight(rays, sample.pictures, references).nonzero().view(-1)
-        if len(kept):
-            rays = rays[kept]
-        behind = background_of(sample.pictures, len(rays), generator)
-        prune = which != LOCAL and self.prunes(step)
-        traced = render_volume(self.model, volume, rays, behind, 0.5 * sample.near, generator, prune, allowed)
-        parts = rendering_loss(traced, rays, self.settings.loss.opacity, self.depth_weight(step), volume.lattice.voxel_size)
-        health = rendering_health(traced, rays)
-        log.note({f"psnr_{which}": health.pop("psnr")})
-        log.note(health | {"loss_depth": parts.depth.detach()})
-        return parts.total
-
     def stage_one(self, sample: Sample, step: int, generator: torch.Generator) -> Outcome:
         """Local loss of one key frame. Leaves gradients in the parameters."""
-        log = Outcome()
-        volume = local_of(self.model, sample, 0, log if self.watched else None)
-        loss = self._loss(volume, sample, sample.targets[0], sample.references[0], self.settings.loss.rays, LOCAL, step, generator, log)
-        loss.backward()
-        log.loss = float(loss.detach())
-        return log
+        loss = StepLoss(self, sample, step, generator)
+        volume = local_of(self.model, sample, 0)
+        if self.watched:
+            loss.watch_encoder()
+        total = loss(volume, sample.targets[0], sample.references[0], self.settings.loss.rays, LOCAL)
+        total.backward()
+        loss.outcome.loss = float(total.detach())
+        return loss.outcome
 
     def stage_two(self, sample: Sample, step: int, generator: torch.Generator) -> Outcome:
         """Local and global loss at every key frame; the gradient through the state is cut every `stage.truncate` key frames."""
-        log, settings, model = Outcome(), self.settings, self.model
-        stage, weights, frames = settings.stage, settings.loss, len(sample.references)
-        rays = max(1, weights.rays // ((1 + stage.levels) * frames))
-        state = begin(model, sample, stage.levels, stage.gamma, stage.most_split)
-        sweeps = keyframe_distributions(sample) if stage.witnesses else None
+        model, stage, weights, frames = self.model, self.settings.stage, self.settings.loss, len(sample.references)
+        loss, rays = StepLoss(self, sample, step, generator), max(1, weights.rays // ((1 + stage.levels) * frames))
+        state = Recurrence(model, sample, stage.levels, stage.gamma, stage.most_split)
+        distributions = keyframe_distributions(sample) if stage.witnesses else [None] * frames
         targets = sample.targets.cpu()  # where pixels are drawn
         pending: list[Tensor] = []
+        if self.watched:
+            loss.watch_encoder()
         for frame in range(frames):
             indices = sample.references[frame]
-            cameras = cameras_of(sample.pictures, indices)
-            views = model.encode(sample.pictures.images[indices], cameras, SIDE if sweeps is None else None)
-            if self.watched and frame == 0:
-                log.note({"feature_deviation": encoder_deviation(model, sample.pictures.images[indices[:1]])})
-            state, local = state.add(model, views, cameras, None if sweeps is None else sweeps[frame])
-            pending.append(weights.local / frames * self._loss(local, sample, targets[frame], indices, rays, LOCAL, step, generator, log))
+            cameras = sample.pictures.cameras(indices)
+            views = model.encode(sample.pictures.images[indices], cameras, None if stage.witnesses else SIDE)
+            local = state.add(views, cameras, distributions[frame])
+            pending.append(weights.local / frames * loss(local, targets[frame], indices, rays, LOCAL))
             # The global volumes answer for every place they have seen, not only for the newest.
-            seen = targets[: frame + 1]
+            seen, references = targets[: frame + 1], sample.references[: frame + 1]
             for level, volume in enumerate(state.volumes):
                 name = FUSED if level == 0 else f"{FUSED}_{level}"
-                allowed = state.allowed(model, level)
-                loss = self._loss(volume, sample, seen, sample.references[: frame + 1], rays, name, step, generator, log, allowed)
-                pending.append(weights.fused / frames * loss)
+                pending.append(weights.fused / frames * loss(volume, seen, references, rays, name, state.allowed(level)))
             if (frame + 1) % stage.truncate == 0 or frame + 1 == frames:
                 total = torch.stack(pending).sum()
                 total.backward()
-                log.loss += float(total.detach())
-                pending, state = [], state.detached()
-        return log
+                loss.outcome.loss += float(total.detach())
+                pending.clear()
+                state.detach()
+        return loss.outcome
 
 
-def begin(model: NerfusionModel, sample: Sample, levels: int, gamma: float = 0.95, most: int = 6000) -> Recurrence:
-    """The recurrence before a sample's first key frame."""
-    return Recurrence.start(model, Lattice(sample.space, sample.resolution), levels, sample.near, sample.far, gamma, most)
+class StepLoss:
+    """Losses of the volumes of one step; what they are made of gathers in `outcome`."""
+
+    def __init__(self, stepper: Stepper, sample: Sample, step: int, generator: torch.Generator) -> None:
+        self.stepper, self.sample, self.step, self.generator, self.outcome = stepper, sample, step, generator, Outcome()
+
+    def watch_encoder(self) -> None:
+        """Note how much the encoder's features of the first key frame vary over the image: it costs one more pass."""
+        with torch.no_grad():
+            features = self.stepper.model.encoder(self.sample.pictures.images[self.sample.references[0, :1]])
+        self.outcome.note({"feature_deviation": feature_deviation(features)})
+
+    def __call__(
+        self, volume: LatentVolume, targets: Tensor, references: Tensor, count: int, name: str, allowed: Tensor | None = None
+    ) -> Tensor:
+        """Loss of a volume on `count` random rays of the images at `targets`, as far as one of `references` shows their end."""
+        stepper, pictures = self.stepper, self.sample.pictures
+        rays = random_rays(pictures, targets, count, self.generator)
+        kept = in_sight(rays, pictures, references).nonzero().view(-1)
+        if len(kept):
+            rays = rays[kept]
+        background = background_of(pictures, len(rays), self.generator)
+        prune = name != LOCAL and stepper.prunes(self.step)
+        traced = trace(volume_field(stepper.model, volume, background, self.sample, prune, allowed), rays, background, self.generator)
+        weights = stepper.settings.loss.opacity, stepper.depth_weight(self.step)
+        parts = rendering_loss(traced, rays, *weights, volume.lattice.voxel_size)
+        health = rendering_health(traced, rays)
+        self.outcome.note({f"psnr_{name}": health.pop("psnr"), **health, "loss_depth": parts.depth})
+        return parts.total
+
+
+def volume_field(
+    model: NerfusionModel, volume: LatentVolume, background: Tensor, sample: Sample, prune: bool, allowed: Tensor | None
+) -> Field:
+    """The field of a local or global volume, over `background` (3,) or (R, 3)."""
+    one = background if background.ndim == 1 else background[0]
+    return make_field(model, volume, one, gamma=GAMMA if prune else None, near=0.5 * sample.near, allowed=allowed)
+
+
+def local_of(model: NerfusionModel, sample: Sample, frame: int) -> LocalVolume:
+    """The local volume of key frame `frame` of a sample."""
+    indices = sample.references[frame]
+    cameras = sample.pictures.cameras(indices)
+    views = model.encode(sample.pictures.images[indices], cameras)
+    return model.local_volume(KeyFrame(views, cameras, sample.near, sample.far), Lattice(sample.space, sample.resolution))
 
 
 def seeded(seed: int, rank: int, step: int) -> torch.Generator:

@@ -1,10 +1,9 @@
 # mypy: disable-error-code="no-untyped-def,untyped-decorator,misc"
-"""From corners of a lattice to the local network's first rows on CUDA, without gradients: two launches, and the device is asked once in
-between (`model._observe` in tensors)."""
+"""A key frame's local volume on CUDA without gradients (`NerfusionModel.local_volume` in tensors): the device is waited for once, for how
+many corners it sees and in which blocks; all else is decided by the processor, which has the blocks' keys, or happens behind it."""
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -12,13 +11,13 @@ import numpy as np
 import torch
 import triton
 import triton.language as tl
-from numpy.typing import NDArray
 from torch import Tensor
 
 from fieldfuse.backends.dispatch import to_device_async
+from fieldfuse.backends.triton.depth_reading import estimate, local
 from fieldfuse.backends.triton.feature_lookup import corners
 from fieldfuse.backends.triton.launch import kernel, pieces, power_of_two
-from fieldfuse.backends.triton.reading import local, sighted
+from fieldfuse.backends.triton.volumes import settle
 
 BLOCK = 32
 PART = 128  # corners of a block that are looked at at once
@@ -70,7 +69,7 @@ def _choose(
     _, _, seen, _ = _seen(x, y, z, size, poses, lenses, sizes, 0, near, far)
     if not SHELL:
         seen = seen & (tl.abs(u) <= bx) & (tl.abs(v) <= by) & (tl.abs(w) <= bz)
-    signed, clear, _ = sighted(x, y, z, truncation * size, table, poses, lenses, sizes, height, width, planes, lowest, step, some)
+    signed, clear, _ = estimate(x, y, z, truncation * size, table, poses, lenses, sizes, height, width, planes, lowest, step, some)
     chosen = seen & (clear > hidden) & some
     kept = chosen.to(tl.int32)
     busy = tl.max((chosen & (signed < free)).to(tl.int32), 0)
@@ -126,7 +125,7 @@ def _observe(
     some = n < count
     row = tl.load(rows + n, some, 0)
     _, _, _, x, y, z, size = _corner(row, keys, voxel, extent, half, cx, cy, cz, shell, some, SHELL)
-    signed, clear, sure = sighted(x, y, z, truncation * size, table, poses, lenses, sizes, height, width, planes, lowest, step, some)
+    signed, clear, sure = estimate(x, y, z, truncation * size, table, poses, lenses, sizes, height, width, planes, lowest, step, some)
     # How many views see it, how large it is there, and how far their directions lie apart.
     views, mark = tl.zeros((BLOCK,), tl.float32), tl.zeros((BLOCK,), tl.float32)
     mx, my, mz = tl.zeros((BLOCK,), tl.float32), tl.zeros((BLOCK,), tl.float32), tl.zeros((BLOCK,), tl.float32)
@@ -219,102 +218,69 @@ def _observe(
 
 
 @dataclass(frozen=True)
-class Found:
-    """Corners that a key frame sees and that may be open.
+class Numbers:
+    """Numbers of `known_terms`, `unproject` and the model's configuration."""
 
-    Attributes:
-        rows: (N,) int64, in no particular order.
-        filled: (M,) bool, blocks that own one of them; busy: those of which one may be near a surface.
-    """
-
-    rows: Tensor
-    filled: NDArray[np.bool_]
-    busy: NDArray[np.bool_]
-
-
-@dataclass(frozen=True)
-class Evidence:
-    """What is known of corners, in rows of F filled blocks, B of them busy; zero where nothing is seen.
-
-    Attributes:
-        latent: (B · 512 + 1, H) first rows of the local network.
-        seen: (B · 512,) bool, where it has any.
-        start: (F · 512 + 1, C) what latents start from.
-        count, weight: (F · 512,) views that see a corner, and how much that weighs.
-    """
-
-    latent: Tensor
-    seen: Tensor
-    start: Tensor
-    count: Tensor
-    weight: Tensor
+    truncation: float
+    hidden: float
+    blind: float
+    free: float
+    gain: float  # of colours
+    coloured: float
+    sampled: int  # channels of the encoder's whose variance is averaged
+    variance: bool
+    channels: int  # of a latent
 
 
-class Observer:
-    """The networks' sight of a key frame and its neighbours (K ≥ 1), without gradients.
-
-    Args:
-        numbers: truncation, hidden, blind and the colours' gain of `model`, `unproject.COLOURED`, and `model`'s limit of free space.
-    """
-
-    def __init__(self, views: Sequence[Any], cameras: Any, near: float, far: float, swept: Any, numbers: tuple[float, ...]) -> None:
-        self.poses, self.lenses, self.sizes = (
-            values.contiguous() for values in (cameras.world_from_camera, cameras.intrinsics, cameras.size)
-        )
-        self.table = swept.table.permute(2, 3, 1, 0).contiguous()
-        self.swept, self.views, self.numbers = swept, views, numbers
-        self.near, self.far = float(max(near, 0.0)), float(far)
-
-    def _space(self, lattice: Any) -> tuple[float, ...]:
-        space = lattice.space
-        return tuple(float(value) for value in (lattice.voxel, space.extent, space.half, *space.centre, space.shell))
-
-    def choose(self, lattice: Any, keys: Tensor, wanted: Tensor | None) -> Found:
-        """Of the corners `wanted` (M · 512,) of blocks (M, 3), None: all, those that the key frame sees. The device is asked once."""
-        blocks, device = keys.shape[0], keys.device
-        count, parts = 512 * blocks, 512 // PART
-        rows = torch.empty(count, dtype=torch.int64, device=device)
-        found = torch.zeros(1 + blocks * parts, dtype=torch.int32, device=device)
-        if count:
-            given = found if wanted is None else wanted.view(torch.uint8), keys, self.poses, self.lenses, self.sizes, self.table
-            box = tuple(side + 1.01 * lattice.voxel for side in lattice.space.box)
-            truncation, hidden, free = self.numbers[0], self.numbers[1], self.numbers[5]
-            _choose[(blocks * parts,)](
-                *given, rows, found, count, *self.table.shape[:3], self.swept.lowest, self.swept.step, *self._space(lattice), *box,
-                self.near, self.far, truncation, hidden, free, ALL=wanted is None, SHELL=lattice.space.shell > 0, BLOCK=PART,
-            )  # fmt: skip
-        told = found.cpu().numpy()
-        marks = np.bitwise_or.reduce(told[1:].reshape(blocks, parts), axis=1)
-        return Found(rows[: told[0]], (marks & 1) > 0, (marks & 2) > 0)
-
-    def observe(
-        self, lattice: Any, keys: Tensor, found: Found, slots: Tensor, layer: Any, sampled: int, variance: bool, channels: int
-    ) -> Evidence:
-        """What is known of corners.
-
-        Args:
-            slots: (2 · M,) int32, of each block among the filled and among the busy ones, −1 where it is not.
-            layer: that evidence goes through, with a ReLU.
-            channels: of latents.
-        """
-        hidden, count = layer.weight.shape[0], found.rows.shape[0]
-        filled, busy = 512 * int(found.filled.sum()), 512 * int(found.busy.sum())
-        sizes = [(busy + 1) * hidden, (filled + 1) * channels, filled, filled, busy // 4]
-        parts = self.poses.new_zeros(sum(sizes)).split(sizes)  # one piece of memory is cleared at once
-        latent, start, counts, weights = parts[0].view(-1, hidden), parts[1].view(-1, channels), parts[2], parts[3]
-        seen = parts[4].view(torch.uint8)
-        if count:
-            fine, coarse = self.views[0].colours, self.views[0].features
-            rows = [(view.features.rows.contiguous(), view.colours.rows.contiguous()) for view in self.views]
-            pictures = to_device_async(np.array([of.data_ptr() for pair in rows for of in pair], np.int64), keys.device)
-            wide = coarse.rows.shape[1]
-            truncation, least, blind, gain, part, _ = self.numbers
-            _observe[(pieces(count, BLOCK),)](
-                found.rows, keys, slots, self.poses, self.lenses, self.sizes, self.table, pictures, layer.weight, layer.bias, latent, start,
-                counts, weights, seen, channels, keys.shape[0], len(self.views), count, *self.table.shape[:3], self.swept.lowest,
-                self.swept.step, *self._space(lattice), self.near, self.far, truncation, least, blind,
-                *coarse.sizes[0], len(coarse.sizes), *fine.sizes[0], len(fine.sizes), part, gain,
-                SHELL=lattice.space.shell > 0, VARIANCE=variance, CHANNELS=wide, WIDE=max(16, power_of_two(wide)),
-                SAMPLED=sampled, STRIDE=coarse.stride, FINE=fine.stride, HIDDEN=hidden, BLOCK=BLOCK,
-            )  # fmt: skip
-        return Evidence(latent, seen.view(torch.bool), start, counts, weights)
+def local_volume(network: Any, frame: Any, lattice: Any, topology: Any, wanted: Tensor | None, numbers: Numbers) -> tuple[Any, ...]:
+    """The fields of a `LocalVolume` behind its lattice, by the `LocalReconstruction` and a `KeyFrame`."""
+    views, cameras, device = frame.views, frame.cameras, topology.device
+    lenses = tuple(values.contiguous() for values in (cameras.world_from_camera, cameras.intrinsics, cameras.size))
+    table = frame.distribution.table.permute(2, 3, 1, 0).contiguous()
+    swept = *table.shape[:3], frame.distribution.lowest, frame.distribution.step
+    space, limits = lattice.space, (float(max(frame.near, 0.0)), float(frame.far))
+    place = tuple(float(value) for value in (lattice.voxel, space.extent, space.half, *space.centre, space.shell))
+    # Corners that the key frame sees, in no particular order, and blocks that own one of them (filled), or one near a surface (busy).
+    blocks, parts = topology.blocks, 512 // PART
+    rows = torch.empty(512 * blocks, dtype=torch.int64, device=device)
+    found = torch.zeros(1 + blocks * parts, dtype=torch.int32, device=device)
+    if blocks:
+        box = tuple(side + 1.01 * lattice.voxel for side in space.box)
+        _choose[(blocks * parts,)](
+            found if wanted is None else wanted.view(torch.uint8), topology.keys, *lenses, table, rows, found, 512 * blocks, *swept, *place,
+            *box, *limits, numbers.truncation, numbers.hidden, numbers.free, ALL=wanted is None, SHELL=space.shell > 0, BLOCK=PART,
+        )  # fmt: skip
+    read = found.cpu().numpy()
+    count, marks = int(read[0]), np.bitwise_or.reduce(read[1:].reshape(blocks, parts), axis=1)
+    filled, busy = (np.flatnonzero(marks & bit).astype(np.int32) for bit in (1, 2))
+    slots = np.full((2, blocks), -1, np.int32)
+    slots[0, filled], slots[1, busy] = (np.arange(len(of), dtype=np.int32) for of in (filled, busy))
+    filled_keys, busy_keys = topology.host[filled], topology.host[busy]
+    # All that the processor has decided goes to the device in one piece.
+    pieces_of: list[Any] = [slots, filled_keys, busy_keys, slots[1, filled], slots[0, busy], busy]
+    whole = to_device_async(np.concatenate([part.reshape(-1) for part in pieces_of]), device).split([part.size for part in pieces_of])
+    kept = topology.alike(whole[1].view(-1, 3), filled_keys)
+    # Beside which blocks they lie is read in a table that others need as well.
+    given = whole[2].view(-1, 3), busy_keys
+    few = kept.some(*given, whole[4], whole[3]) if wanted is None else topology.some(*given, whole[5], whole[0][blocks:])
+    # Evidence in rows of F filled blocks, B of them busy, zero where nothing is seen; one piece of memory is cleared at once.
+    hidden = network.project.weight.shape[0]
+    corners_of, working = 512 * len(filled), 512 * len(busy)
+    sizes = [(working + 1) * hidden, (corners_of + 1) * numbers.channels, corners_of, corners_of, working // 4]
+    latent, start, counts, weights, seen = lenses[0].new_zeros(sum(sizes)).split(sizes)
+    latent, start, seen = latent.view(-1, hidden), start.view(-1, numbers.channels), seen.view(torch.uint8)
+    if count:
+        fine, coarse = views[0].colours, views[0].features
+        tables = [(view.features.rows.contiguous(), view.colours.rows.contiguous()) for view in views]
+        pictures = to_device_async(np.array([of.data_ptr() for pair in tables for of in pair], np.int64), device)
+        width = coarse.rows.shape[1]
+        _observe[(pieces(count, BLOCK),)](
+            rows, topology.keys, whole[0], *lenses, table, pictures, network.project.weight, network.project.bias, latent, start,
+            counts, weights, seen, numbers.channels, blocks, len(views), count, *swept, *place, *limits, numbers.truncation,
+            numbers.hidden, numbers.blind, *coarse.sizes[0], len(coarse.sizes), *fine.sizes[0], len(fine.sizes), numbers.coloured,
+            numbers.gain, SHELL=space.shell > 0, VARIANCE=numbers.variance, CHANNELS=width, WIDE=max(16, power_of_two(width)),
+            SAMPLED=numbers.sampled, STRIDE=coarse.stride, FINE=fine.stride, HIDDEN=hidden, BLOCK=BLOCK,
+        )  # fmt: skip
+    learned = network.learned(latent, few, seen.view(torch.bool)) if len(busy) else start
+    raw, out = settle(start, learned, whole[3])
+    return kept, out, counts, raw, weights, few, whole[4]

@@ -1,8 +1,8 @@
-"""What the GRU does between its convolutions, compiled: a pass over the rows each time, instead of one for each operation.
+"""What the GRU does between its convolutions: a pass over the rows each time, instead of one for each operation.
 
-Rows that the key frame does not see cost a look. Latents are read where the volumes keep them, not gathered first, and convolutions'
-results in the numbers that they come in. Values equal those of `FusionGRU.forward` to rounding (tests compare them), whatever the number of
-threads. tanh is a quotient of polynomials, which the processor computes for all channels at once; its error is below 3e-7.
+Rows that the key frame does not see cost a look. Latents are read where the volumes hold them, not gathered first. Values equal those of
+`FusionGRU.forward` to rounding (tests compare them), whatever the number of threads. tanh is a quotient of polynomials, which the processor
+computes for all channels at once; its error is below 3e-7.
 """
 
 from __future__ import annotations
@@ -11,64 +11,12 @@ from typing import Any
 
 import numpy as np
 import torch
-from numba import njit, types
-from numba.extending import overload
+from numba import njit
 from torch import Tensor
 
-from fieldfuse.nerfusion.compiled import OPTIONS, array, spread
-from fieldfuse.nerfusion.lattice import LatentVolume, LocalVolume
+from fieldfuse.backends.numba.tensors import OPTIONS, F, array, spread
 
-F = np.float32
 LARGE = F(4.5)  # half of where tanh is 1 in float32
-
-
-def numbers(values: Tensor) -> Any:
-    """What a kernel takes: float32, or the bits of bfloat16; no copy."""
-    values = values.detach()
-    return values.view(torch.int16).numpy().view(np.uint16) if values.dtype == torch.bfloat16 else values.numpy()
-
-
-def _read(row: Any, bits: Any, values: Any) -> None:
-    """The numbers of `row` → float32 `values`, which are the memory of `bits`."""
-
-
-@overload(_read)
-def _read_of(row: Any, bits: Any, values: Any) -> Any:
-    if row.dtype == types.uint16:
-
-        def widened(row: Any, bits: Any, values: Any) -> None:
-            for c in range(len(row)):
-                bits[c] = np.uint32(row[c]) << np.uint32(16)
-
-        return widened
-
-    def same(row: Any, bits: Any, values: Any) -> None:
-        for c in range(len(row)):
-            values[c] = row[c]
-
-    return same
-
-
-def _write(row: Any, bits: Any, values: Any) -> None:
-    """float32 `values`, which are the memory of `bits`, → `row`, to the nearest number that it can hold."""
-
-
-@overload(_write)
-def _write_of(row: Any, bits: Any, values: Any) -> Any:
-    if row.dtype == types.uint16:
-
-        def rounded(row: Any, bits: Any, values: Any) -> None:
-            for c in range(len(row)):
-                odd = (bits[c] >> np.uint32(16)) & np.uint32(1)
-                row[c] = np.uint16((bits[c] + np.uint32(0x7FFF) + odd) >> np.uint32(16))
-
-        return rounded
-
-    def same(row: Any, bits: Any, values: Any) -> None:
-        for c in range(len(row)):
-            row[c] = values[c]
-
-    return same
 
 
 @njit(**OPTIONS)
@@ -100,71 +48,49 @@ def _average(state: Any, count: Any, local: Any, weight: Any, seen: Any, least: 
 def _beside(place: Any, state: Any, count: Any, local: Any, seen: Any, both: Any) -> None:
     """[H, V] of the rows `place`, zero where the key frame does not see."""
     channels = state.shape[1]
-    values = np.empty(channels, np.float32)
-    bits = values.view(np.uint32)
     for i in range(len(place)):
         row = place[i]
         if seen[row] == F(0):
-            both[i] = 0
+            both[i] = F(0)
             continue
         known = F(1) if count[row] > F(0) else F(0)
         for c in range(channels):
-            values[c] = known * state[row, c]
-        _write(both[i, :channels], bits, values)
-        for c in range(channels):
-            values[c] = local[row, c]
-        _write(both[i, channels:], bits, values)
+            both[i, c] = known * state[row, c]
+            both[i, channels + c] = local[row, c]
 
 
 @njit(**OPTIONS)
 def _forget(place: Any, state: Any, count: Any, seen: Any, reset: Any, both: Any) -> None:
     """H → r ∘ H in what `_beside` wrote."""
-    channels = state.shape[1]
-    values = np.empty(channels, np.float32)
-    bits = values.view(np.uint32)
     for i in range(len(place)):
         row = place[i]
         if seen[row] == F(0) or count[row] == F(0):
             continue
-        _read(reset[i], bits, values)
-        for c in range(channels):
-            values[c] = (F(0.5) + F(0.5) * tanh(F(0.5) * values[c])) * state[row, c]
-        _write(both[i, :channels], bits, values)
+        for c in range(state.shape[1]):
+            both[i, c] = (F(0.5) + F(0.5) * tanh(F(0.5) * reset[i, c])) * state[row, c]
 
 
 @njit(**OPTIONS)
 def _step(
-    place: Any,
-    state: Any,
-    count: Any,
-    raw: Any,
-    weight: Any,
-    seen: Any,
-    update: Any,
-    candidate: Any,
-    limits: Any,
-    held: int,
-    out: Any,
+    place: Any, state: Any, count: Any, raw: Any, weight: Any, seen: Any, update: Any, candidate: Any, limits: Any, held: int, out: Any
 ) -> None:
     """H' into the rows `place` of `out`; `limits`: least w, most n, most that may be added to channel `held`."""
     channels = state.shape[1]
-    gate, learned = np.empty(channels, np.float32), np.empty(channels, np.float32)
-    gate_bits, learned_bits = gate.view(np.uint32), learned.view(np.uint32)
+    learned = np.empty(channels, np.float32)
     least, most, change = limits[0], limits[1], limits[2]
     for i in range(len(place)):
         row = place[i]
         if seen[row] == F(0):
             continue
-        _read(candidate[i], learned_bits, learned)
+        learned[:] = candidate[i]
         learned[held] = change * tanh(learned[held] / change)
         if count[row] == F(0):  # nothing was known: z = 1
             for c in range(channels):
                 out[row, c] = tanh(raw[row, c] + learned[c])
             continue
-        _read(update[i], gate_bits, gate)
         w, n = max(weight[row], least), min(count[row], most)
         for c in range(channels):
-            s = F(0.5) + F(0.5) * tanh(F(0.5) * gate[c])
+            s = F(0.5) + F(0.5) * tanh(F(0.5) * update[i, c])
             z = s * w / (s * w + (F(1) - s) * n)  # σ(u + log(w / n))
             before = state[row, c]
             out[row, c] = before + z * (tanh(raw[row, c] + learned[c]) - before)
@@ -180,7 +106,7 @@ class Step:
         least, most: bounds of w and n.
     """
 
-    def __init__(self, place: Tensor, part: LatentVolume, local: LocalVolume, least: float, most: float) -> None:
+    def __init__(self, place: Tensor, part: Any, local: Any, least: float, most: float) -> None:
         self.place, self.state, self.count, self.local = array(place), array(part.rows), array(part.count), array(local.rows)
         self.raw, self.weight, self.seen = array(local.raw), array(local.weight), array(local.count)
         self.least, self.most = F(least), F(most)
@@ -193,17 +119,16 @@ class Step:
         spread(lambda i: _average(*(values[i] for values in given), self.least, self.most, out[i]), len(self.count))
         return torch.from_numpy(out)
 
-    def beside(self, kind: torch.dtype) -> Tensor:
-        """(M' · 512 + 1, 2C) [H, V] in the numbers that convolutions compute in."""
-        both = torch.empty((len(self.place) + 1, 2 * self.state.shape[1]), dtype=kind)
+    def beside(self) -> Tensor:
+        """(M' · 512 + 1, 2C) [H, V]."""
+        both = np.empty((len(self.place) + 1, 2 * self.state.shape[1]), np.float32)
         both[-1] = 0
-        out = numbers(both)
-        spread(lambda i: _beside(self.place[i], self.state, self.count, self.local, self.seen, out[i]), len(self.place))
-        return both
+        spread(lambda i: _beside(self.place[i], self.state, self.count, self.local, self.seen, both[i]), len(self.place))
+        return torch.from_numpy(both)
 
     def forget(self, reset: Tensor, both: Tensor) -> None:
         """[H, V] → [r ∘ H, V], in place; `reset`: M_r's."""
-        gate, out = numbers(reset), numbers(both)
+        gate, out = array(reset.float()), both.numpy()
         spread(lambda i: _forget(self.place[i], self.state, self.count, self.seen, gate[i], out[i]), len(self.place))
 
     def update(self, update: Tensor, candidate: Tensor, channel: int, change: float, rows: Tensor) -> None:
@@ -213,6 +138,6 @@ class Step:
             update, candidate: M_z's, M_t's.
             channel, change: that of the latent to which at most so much is added.
         """
-        z, t, out = numbers(update), numbers(candidate), rows.numpy()
+        z, t, out = array(update.float()), array(candidate.float()), rows.numpy()
         known, limits = (self.state, self.count, self.raw, self.weight, self.seen), np.array([self.least, self.most, change], np.float32)
         spread(lambda i: _step(self.place[i], *known, z[i], t[i], limits, channel, out), len(self.place))

@@ -1,4 +1,4 @@
-"""Bilinear lookup in pyramids on the CPU, compiled: what `Pyramid.lookup` does with a dozen whole tensors, place by place."""
+"""Bilinear lookup in pyramids, place by place (`Pyramid.lookup` in tensors)."""
 
 from __future__ import annotations
 
@@ -7,11 +7,10 @@ from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
-import torch
 from numba import njit
 from torch import Tensor
 
-from fieldfuse.nerfusion.compiled import OPTIONS, F, spread
+from fieldfuse.backends.numba.tensors import OPTIONS, F, array, spread
 
 
 @njit(**OPTIONS)
@@ -38,20 +37,22 @@ def _look_up(rows: Any, levels: Any, stride: Any, bounds: Any, pixels: Any, foot
             own[first + k] = w00 * a[k] + w01 * b[k] + w10 * c[k] + w11 * d[k]
 
 
-def look_up(
-    rows: Tensor, sizes: Sequence[tuple[int, int]], stride: int, pixels: Tensor, footprint: Tensor, out: Tensor, first: int = 0
-) -> None:
-    """`Pyramid.lookup` of float32 values on the CPU into columns `first` … of `out` (N, C'), which lies in memory row by row."""
-    ends = np.cumsum([height * width for height, width in sizes])
-    levels = np.array([(end - height * width, height, width) for end, (height, width) in zip(ends, sizes, strict=True)], np.int64)
-    bounds = np.array([stride * math.sqrt(2) * 2**level for level in range(len(sizes) - 1)], np.float32)  # nearest by ratio
-    given = rows.detach().contiguous().numpy(), levels, F(stride), bounds
-    places, sides, into = pixels.contiguous().numpy(), footprint.contiguous().numpy(), out.numpy()
+def look_up(views: Sequence[Any], pixels: Tensor, step: Tensor, footprint: Tensor, part: float) -> Tensor:
+    """(K, N, C) as `unproject.look_up`, of K views at pixels (K, N, 2), with steps (N,) and footprints (K, N)."""
+    features, colours = views[0].features.rows.shape[1], views[0].colours.rows.shape[1]
+    out = step.new_empty((len(views), len(step), features + 2 * colours))
+    for view, places, cells, into in zip(views, pixels, footprint, out, strict=True):
+        _into(view.features, places, step, into, 0)
+        _into(view.colours, places, step, into, features)
+        _into(view.colours, places, part * cells, into, features + colours)
+    return out
+
+
+def _into(pyramid: Any, pixels: Tensor, footprint: Tensor, out: Tensor, first: int) -> None:
+    """`pyramid.lookup` into columns `first` … of `out` (N, C')."""
+    ends = np.cumsum([height * width for height, width in pyramid.sizes])
+    levels = np.array([(end - height * width, height, width) for end, (height, width) in zip(ends, pyramid.sizes, strict=True)], np.int64)
+    bounds = np.array([pyramid.stride * math.sqrt(2) * 2**level for level in range(len(levels) - 1)], np.float32)  # nearest by ratio
+    given = array(pyramid.rows), levels, F(pyramid.stride), bounds
+    places, sides, into = array(pixels), array(footprint), out.numpy()
     spread(lambda n: _look_up(*given, places[n], sides[n], first, into[n]), len(places))
-
-
-def fits(out_of: Sequence[Tensor], *values: Tensor) -> bool:
-    """Whether the kernel can take these: float32 on the CPU, and nobody asks for gradients."""
-    if torch.is_grad_enabled() and any(rows.requires_grad for rows in out_of):
-        return False
-    return all(value.device.type == "cpu" and value.dtype == torch.float32 for value in (*out_of, *values))

@@ -1,5 +1,5 @@
 # mypy: disable-error-code="no-untyped-def,untyped-decorator,misc"
-"""The plane sweep on CUDA: costs of planes, semi-global matching, likelihoods and their table, a launch each (`compiled.py` on the CPU).
+"""The plane sweep on CUDA: descriptors, costs of planes, semi-global matching, likelihoods and their table, a launch each.
 
 Volumes are (P, D), pixel by pixel with the planes next to each other in memory, since all that follows goes along planes. Results equal
 those of the tensors to rounding.
@@ -24,6 +24,8 @@ COLOURS = 3
 TILE = (32, 16)  # pixels and planes that are compared at once
 PLANES = 256  # of a pixel at least, with those that there are not: more planes are compiled for once more
 PIXELS = 4  # whose planes are summed at once
+BLOCK = 32  # pixels whose neighbours or channels are read together
+GROUPS = (CHANNELS - COLOURS) // 9  # of 3×3 neighbours, the n-th of them n pixels apart
 
 
 @triton.jit
@@ -111,28 +113,28 @@ def noted(pictures: Sequence[Tensor]) -> Tensor:
     return to_device_async(np.array(rows, np.int64), pictures[0].device)
 
 
-def costs(described: Sequence[Tensor], cameras: Any, inverses: Tensor, rays: Tensor, own: Tensor, gain: float, unknown: float) -> Tensor:
+def costs(descriptors: Sequence[Tensor], cameras: Any, inverses: Tensor, rays: Tensor, own: Tensor, gain: float, unknown: float) -> Tensor:
     """(P, D) of pixels of the first view.
 
     Args:
-        described: K ≥ 2 times (21, h, w), of any sizes; cameras: K.
+        descriptors: K ≥ 2 times (21, h, w), of any sizes; cameras: K.
         inverses: (D,); rays: (P, 3), working axes; own: (P, 21); all contiguous.
     """
     pixels, planes = len(rays), len(inverses)
-    described = [picture.contiguous() for picture in described]
+    descriptors = [picture.contiguous() for picture in descriptors]
     out = rays.new_empty((pixels, planes))
     if pixels:
         grid = (pieces(pixels, TILE[0]), pieces(planes, TILE[1]))
         _cost[grid](
-            own, rays, inverses, noted(described), *lens(cameras), len(described), out, pixels, planes, gain, unknown,
+            own, rays, inverses, noted(descriptors), *lens(cameras), len(descriptors), out, pixels, planes, gain, unknown,
             CHANNELS=CHANNELS, COLOURS=COLOURS, BP=TILE[0], BD=TILE[1],
         )  # fmt: skip
     return out
 
 
-@kernel("cost", "said", "out")
-def _path(cost, said, is_said, out, height, width, planes, small, large, BD: tl.constexpr):
-    """The cheapest paths along one line of pixels in one of four directions, of the cost less what is said where anything is."""
+@kernel("cost", "correction", "out")
+def _path(cost, correction, corrects, out, height, width, planes, small, large, BD: tl.constexpr):
+    """The cheapest paths along one line of pixels in one of four directions, of the cost less the correction where there is one."""
     line, way = tl.program_id(0), tl.program_id(1)
     upright = way < 2
     lines = tl.where(upright, width, height)
@@ -145,21 +147,21 @@ def _path(cost, said, is_said, out, height, width, planes, small, large, BD: tl.
         step = tl.where(back, -step, step)
         d = tl.arange(0, BD)
         inside = d < planes
-        heard = inside & (is_said > 0)
+        corrected = inside & (corrects > 0)
         to_left, to_right = tl.maximum(d - 1, 0), tl.minimum(d + 1, BD - 1)
         never = float("inf")
         place = first.to(tl.int64)
-        before = tl.load(cost + place * planes + d, inside, never) - tl.load(said + place * planes + d, heard, 0.0)
+        before = tl.load(cost + place * planes + d, inside, never) - tl.load(correction + place * planes + d, corrected, 0.0)
         out += way.to(tl.int64) * height * width * planes
         tl.store(out + place * planes + d, before, inside)
         place += step
         coming = tl.load(cost + place * planes + d, inside & (length > 1), never)
-        comes = tl.load(said + place * planes + d, heard & (length > 1), 0.0)
+        less = tl.load(correction + place * planes + d, corrected & (length > 1), 0.0)
         i = 1
         while i < length:
-            now = coming - comes
-            coming = tl.load(cost + (place + step) * planes + d, inside & (i + 1 < length), never)  # asked for early: it takes a while
-            comes = tl.load(said + (place + step) * planes + d, heard & (i + 1 < length), 0.0)
+            now = coming - less
+            coming = tl.load(cost + (place + step) * planes + d, inside & (i + 1 < length), never)  # loaded early: it takes a while
+            less = tl.load(correction + (place + step) * planes + d, corrected & (i + 1 < length), 0.0)
             best = tl.min(before, 0)
             left = tl.where(d > 0, tl.gather(before, to_left, 0), never)
             right = tl.where(d < BD - 1, tl.gather(before, to_right, 0), never)
@@ -212,15 +214,15 @@ def wide(planes: int) -> int:
     return max(PLANES, power_of_two(planes))
 
 
-def _paths(volume: Tensor, small: float, large: float, said: Tensor | None = None) -> Tensor:
-    """(h, w, D), contiguous → (4, h, w, D): down, up, right, left; of costs less what is `said`, as large."""
+def _paths(volume: Tensor, small: float, large: float, correction: Tensor | None = None) -> Tensor:
+    """(h, w, D), contiguous → (4, h, w, D): down, up, right, left; of costs less the correction, as large."""
     height, width, planes = volume.shape
     paths = volume.new_empty((4, height, width, planes))
-    told = volume if said is None else said
     # One warp a line: what goes from plane to plane stays within it.
     _path[(max(height, width), 4)](
-        volume, told, int(said is not None), paths, height, width, planes, small, large, BD=wide(planes), num_warps=1
-    )
+        volume, volume if correction is None else correction, int(correction is not None), paths, height, width, planes, small, large,
+        BD=wide(planes), num_warps=1,
+    )  # fmt: skip
     return paths
 
 
@@ -239,8 +241,8 @@ def semi_global(cost: Tensor, small: float, large: float) -> Tensor:
     return _paths(rows(cost), small, large).mean(0).permute(2, 0, 1)
 
 
-def distribution(cost: Tensor, small: float, large: float, temperature: float) -> Tensor:
-    """(D, h, w) costs → likelihoods, see `matching.distribution`; planes of a pixel lie next to each other."""
+def smoothed_softmax(cost: Tensor, small: float, large: float, temperature: float) -> Tensor:
+    """(D, h, w) costs → likelihoods, see `matching.smoothed_softmax`; planes of a pixel lie next to each other."""
     volume = rows(cost)
     height, width, planes = volume.shape
     paths, out = _paths(volume, small, large), torch.empty_like(volume)
@@ -272,7 +274,7 @@ def _tabled(likely, out, pixels, planes, step, window: tl.constexpr, BP: tl.cons
 
 
 @kernel("paths", "out")
-def _decided(paths, out, pixels, planes, scale, step, window: tl.constexpr, BP: tl.constexpr, BD: tl.constexpr):
+def _table_of_costs(paths, out, pixels, planes, scale, step, window: tl.constexpr, BP: tl.constexpr, BD: tl.constexpr):
     p = (tl.program_id(0) * BP + tl.arange(0, BP)).to(tl.int64)
     d = tl.arange(0, BD)
     table_of(likelihood(paths, p, d, pixels, planes, scale), out, p, d, pixels, planes, step, window, BP, BD)
@@ -293,23 +295,27 @@ def table(likely: Tensor, step: float, peak: int) -> Tensor:
     return out.permute(3, 2, 0, 1)
 
 
-def decided(cost: Tensor, said: Tensor | None, small: float, large: float, temperature: float, step: float, peak: int) -> Tensor:
-    """`table` of the `distribution` of (D, h, w) costs less what is `said`, as large, in two launches."""
-    volume = rows(cost)
+def table_of_costs(cost: Tensor, correction: Tensor | None, smoothing: tuple[float, float, float], step: float, peak: int) -> Tensor:
+    """`table` of the `smoothed_softmax` of (D, h, w) costs less a correction, as large, in two launches.
+
+    Args:
+        smoothing: penalties and temperature.
+    """
+    volume, (small, large, temperature) = rows(cost), smoothing
     height, width, planes = volume.shape
-    paths = _paths(volume, small, large, None if said is None else rows(said))
+    paths = _paths(volume, small, large, None if correction is None else rows(correction))
     out = volume.new_empty((height, width, planes, 3))
-    grid = (pieces(height * width, PIXELS),)
-    _decided[grid](paths, out, height * width, planes, -1 / temperature, step, window=window_of(peak, planes), BP=PIXELS, BD=wide(planes))
+    grid, sizes = (pieces(height * width, PIXELS),), {"window": window_of(peak, planes), "BP": PIXELS, "BD": wide(planes)}
+    _table_of_costs[grid](paths, out, height * width, planes, -1 / temperature, step, **sizes)
     return out.permute(3, 2, 0, 1)
 
 
-@kernel("paths", "rays", "inverses", "says", "places", "row")
-def _alone(
-    paths, rays, inverses, pose, lens, size, says, places, row, height, width, planes, scale, lowest, step, gain, against, least,
+@kernel("paths", "rays", "inverses", "odds", "places", "row")
+def _own_estimate(
+    paths, rays, inverses, pose, lens, size, odds, places, row, height, width, planes, scale, lowest, step, gain, against, least,
     window: tl.constexpr, ABOUT: tl.constexpr, BP: tl.constexpr, BD: tl.constexpr,
 ):  # fmt: skip
-    """What a key frame says for and against surface, where it is sure of it, and what it is asked by."""
+    """Log odds of surface, the likeliest places where one depth stands out, and the numbers by which other key frames read them."""
     pixels = height * width
     p = (tl.program_id(0) * BP + tl.arange(0, BP)).to(tl.int64)
     d = tl.arange(0, BD)
@@ -317,8 +323,8 @@ def _alone(
     likely = likelihood(paths, p, d, pixels, planes, scale)
     nearer = tl.cumsum(likely, 1, reverse=True) - 0.5 * likely
     hidden, not_free = beside(nearer, ABOUT, 0.0, BP, BD), beside(nearer, -ABOUT, 1.0, BP, BD)
-    told = tl.log(gain * tl.maximum(not_free - hidden, 0.0) + hidden + against)
-    tl.store(says + p[:, None] * planes + d[None, :], told, some[:, None] & (d < planes)[None, :])
+    ratio = tl.log(gain * tl.maximum(not_free - hidden, 0.0) + hidden + against)
+    tl.store(odds + p[:, None] * planes + d[None, :], ratio, some[:, None] & (d < planes)[None, :])
     between = nearer - beside(nearer, 1, 0.0, BP, BD)
     best = tl.argmax(tl.where((d + 1 < planes)[None, :], between, -1.0), 1)
     middle = 0.5 * (tl.load(inverses + best) + tl.load(inverses + best + 1))
@@ -335,26 +341,112 @@ def _alone(
         tl.store(row + k, tl.where(k < 20, spaced, shape), k < 23)
 
 
-def alone(
-    cost: Tensor, rays: Tensor, inverses: Tensor, camera: Any, lowest: float, step: float, smoothing: tuple[float, float, float],
-    peak: int, weights: tuple[float, float, int], least: float,
-) -> tuple[Tensor, Tensor, Tensor]:  # fmt: skip
-    """What a key frame's pictures say alone, without the table that nobody reads.
+def own_estimate(
+    costs: Any, smoothing: tuple[float, float, float], peak: int, weights: tuple[float, float, int], least: float
+) -> tuple[Tensor, Tensor, Tensor]:
+    """What a key frame's images show alone, without the table that nobody reads.
 
     Args:
-        cost: (D, h, w) at planes (D,) along rays (h · w, 3).
-        smoothing: penalties and temperature of `distribution`.
-        weights: of `reading.says`; least: of `reading.surest`.
+        costs: `CostVolume` at planes (D,) along rays (h · w, 3).
+        smoothing: penalties and temperature.
+        weights: of `depth_reading.log_odds`; least: of `depth_reading.confident_points`.
 
     Returns:
-        (D, h, w) of `reading.says`, (h · w, 3) of `reading.surest`, and (23,) of `reading.numbers`.
+        (D, h, w) of `log_odds`, (h · w, 3) of `confident_points`, and (23,) of `numbers`, all of `depth_reading`.
     """
-    volume = rows(cost)
+    volume, rays = rows(costs.cost), costs.rays
     height, width, planes = volume.shape
     paths = _paths(volume, *smoothing[:2])
-    says, places, row = torch.empty_like(volume), rays.new_empty((height * width, 3)), rays.new_empty(23)
-    _alone[(pieces(height * width, PIXELS),)](
-        paths, rays.contiguous(), inverses, *lens(camera), says, places, row, height, width, planes, -1 / smoothing[2], lowest, step,
-        *weights[:2], least, window=window_of(peak, planes), ABOUT=weights[2], BP=PIXELS, BD=wide(planes),
+    odds, places, row = torch.empty_like(volume), rays.new_empty((height * width, 3)), rays.new_empty(23)
+    _own_estimate[(pieces(height * width, PIXELS),)](
+        paths, rays.contiguous(), costs.inverses, *lens(costs.camera), odds, places, row, height, width, planes, -1 / smoothing[2],
+        costs.lowest, costs.step, *weights[:2], least, window=window_of(peak, planes), ABOUT=weights[2], BP=PIXELS, BD=wide(planes),
     )  # fmt: skip
-    return says.permute(2, 0, 1), places, row
+    return odds.permute(2, 0, 1), places, row
+
+
+@kernel("out")
+def _descriptors(
+    images, out, height, width, per_view, per_channel, per_row, per_pixel, red, green, blue, contrast, BLOCK: tl.constexpr,
+    COLOURS: tl.constexpr, GROUPS: tl.constexpr,
+):  # fmt: skip
+    """Colours, and the neighbours' grey without its mean, divided by its contrast."""
+    p = tl.program_id(0) * BLOCK + tl.arange(0, BLOCK)[:, None]
+    view = tl.program_id(1)
+    k = tl.arange(0, 16)[None, :]
+    y, x = p // width, p % width
+    picture = images + view * per_view
+    made = out + view * (COLOURS + 9 * GROUPS) * height * width + p
+    some = p < height * width
+    is_colour = some & (k < COLOURS)
+    colour = tl.load(picture + k * per_channel + y * per_row + x * per_pixel, is_colour, 0.0)
+    tl.store(made + k * height * width, colour, is_colour)
+    inside = some & (k < 9)
+    for group in tl.static_range(GROUPS):
+        row = tl.minimum(tl.maximum(y + (k // 3 - 1) * (group + 1), 0), height - 1)
+        column = tl.minimum(tl.maximum(x + (k % 3 - 1) * (group + 1), 0), width - 1)
+        place = picture + row * per_row + column * per_pixel
+        grey = red * tl.load(place, inside, 0.0) + green * tl.load(place + per_channel, inside, 0.0)
+        grey += blue * tl.load(place + 2 * per_channel, inside, 0.0)
+        apart = tl.where(inside, grey - (tl.sum(grey, 1) / 9)[:, None], 0.0)
+        strength = tl.sqrt(tl.sum(apart * apart, 1) / 9) + contrast
+        tl.store(made + (COLOURS + 9 * group + k) * height * width, apart / strength[:, None], inside)
+
+
+def patch_descriptors(images: Tensor, grey: tuple[float, float, float], contrast: float) -> Tensor:
+    """(V, 3, H, W), in any order in memory → (V, 21, H, W) of `matching.patch_descriptors` at this size."""
+    views, _, height, width = images.shape
+    out = torch.empty((views, CHANNELS, height, width), dtype=images.dtype, device=images.device)
+    _descriptors[(pieces(height * width, BLOCK), views)](
+        images, out, height, width, *images.stride(), *grey, contrast, BLOCK=BLOCK, COLOURS=COLOURS, GROUPS=GROUPS
+    )
+    return out
+
+
+@kernel("rays", "own", "inverses")
+def _grid(
+    picture, pose, focal, size, rays, own, inverses, tall, wide, height, width, planes, first, last, step, BLOCK: tl.constexpr,
+    CHANNELS: tl.constexpr,
+):  # fmt: skip
+    """Rays and descriptors of a grid's pixels, and planes from the first to the last as `torch.linspace` steps from both ends."""
+    p = tl.program_id(0) * BLOCK + tl.arange(0, BLOCK)
+    some = p < height * width
+    u, v = (p % width + 0.5) / width * 2 - 1, (p // width + 0.5) / height * 2 - 1
+    one, two, three, four, of_one, of_two, of_three, of_four = corners(u, v, tall, wide)
+    c = tl.arange(0, 32)[None, :]
+    inside = some[:, None] & (c < CHANNELS)
+    channel = picture + c * tall * wide
+    found = tl.load(channel + one[:, None], inside, 0.0) * of_one[:, None] + tl.load(channel + two[:, None], inside, 0.0) * of_two[:, None]
+    found += tl.load(channel + three[:, None], inside, 0.0) * of_three[:, None]
+    found += tl.load(channel + four[:, None], inside, 0.0) * of_four[:, None]
+    tl.store(own + p[:, None] * CHANNELS + c, found, inside)
+    x = ((u + 1) / 2 * tl.load(size) - tl.load(focal + 2)) / tl.load(focal)
+    y = ((v + 1) / 2 * tl.load(size + 1) - tl.load(focal + 3)) / tl.load(focal + 1)
+    for axis in tl.static_range(3):
+        turn = pose + 4 * axis
+        tl.store(rays + 3 * p + axis, x * tl.load(turn) + y * tl.load(turn + 1) + tl.load(turn + 2), some)
+    inverse = tl.where(p < planes // 2, first + p * step, last - (planes - 1 - p) * step)
+    tl.store(inverses + p, inverse, p < planes)
+
+
+def pixels(
+    descriptors: Tensor, camera: Any, shape: tuple[int, int], planes: int, first: float, last: float
+) -> tuple[Tensor, Tensor, Tensor]:
+    """A grid of pixels of the first view, and planes.
+
+    Args:
+        descriptors: (21, H, W) of the first view.
+        camera: its camera is the first.
+        shape: rows and columns of pixels, P in all, spread evenly over the image.
+        planes: how many inverse depths D ≥ 2, evenly from `first` to `last`.
+
+    Returns:
+        Rays (P, 3) of unit depth in working axes, their descriptors (P, 21), and inverse depths (D,).
+    """
+    descriptors, count = descriptors.contiguous(), shape[0] * shape[1]
+    rays, own, inverses = (descriptors.new_empty(size) for size in ((count, 3), (count, CHANNELS), (planes,)))
+    _grid[(pieces(max(count, planes), BLOCK),)](
+        descriptors, *lens(camera), rays, own, inverses, *descriptors.shape[1:], *shape, planes,
+        first, last, (last - first) / (planes - 1), BLOCK=BLOCK, CHANNELS=CHANNELS,
+    )  # fmt: skip
+    return rays, own, inverses
