@@ -34,7 +34,7 @@ MARK = "fieldfuse: "  # what the one sentence of an error begins with
 MODELLED = ("view_dependence", "background")  # parts of the field, no corrections
 LONGEST = 250  # characters of a sentence in the table; whole in captures.json
 RUN = (
-    "from fieldfuse.poses.worker import die_with_parent; die_with_parent(); from fieldfuse.pipelines.cli import program; program()"
+    "from fieldfuse.poses.child import die_with_parent; die_with_parent(); from fieldfuse.pipelines.cli import program; program()"
 )  # the process of one run
 
 

@@ -55,8 +55,9 @@ def bake_run(place: Place, options: dict[str, Any], seen: float, to: Path | None
     from fieldfuse.pipelines.fields import finished_field
     from fieldfuse.pipelines.job import open_job
     from fieldfuse.pipelines.pictures import baked, baked_place
-    from fieldfuse.pipelines.prepare import BEFORE, prepare
+    from fieldfuse.pipelines.prepare import prepare
     from fieldfuse.pipelines.rendered import to_picture
+    from fieldfuse.pipelines.stages import BEFORE
     from fieldfuse.render.bake_file import read_baked, write_baked
     from fieldfuse.render.image import make_renderer, render_view
 

@@ -25,11 +25,11 @@ from fieldfuse.pipelines.fields import (
 )
 from fieldfuse.pipelines.job import Job, open_job
 from fieldfuse.pipelines.options import Place
-from fieldfuse.pipelines.prepare import BEFORE, Prepared, prepare
+from fieldfuse.pipelines.prepare import Prepared, prepare
 from fieldfuse.pipelines.reconstruct import FOR_FIELD, RESULTS
 from fieldfuse.pipelines.rendered import Pictures
 from fieldfuse.pipelines.schemas import CompareScores, read_checked
-from fieldfuse.pipelines.stages import Stage
+from fieldfuse.pipelines.stages import BEFORE, Stage
 from fieldfuse.pipelines.summary import base_data, warnings_of
 from fieldfuse.pipelines.surfaces import fuse_tsdf, match_images
 

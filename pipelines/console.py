@@ -17,7 +17,7 @@ from typing import IO, Any
 from fieldfuse.errors import FieldfuseError
 from fieldfuse.progress import Progress
 
-AGAIN = 0.02  # seconds until an interrupt that got lost is told again
+AGAIN = 0.02  # seconds until an interrupt that got lost is raised again
 PLAIN_EVERY = 10.0  # seconds between two lines where there is no terminal
 STOPPING = "stopping: the current stage is brought to an end (Ctrl-C again to quit at once)"
 
@@ -69,7 +69,7 @@ class ConsoleProgress(Progress):
         self._stop.set()
 
     def resume(self) -> None:
-        """What was asked to stop has stopped and is kept; the short stages after it may run."""
+        """What the user stopped is kept; the short stages after it may run."""
         self._stop.clear()
 
     def seconds_left(self, done: float, total: float) -> float | None:
@@ -86,13 +86,13 @@ class ConsoleProgress(Progress):
     @contextmanager
     def listening(self) -> Iterator[None]:
         """Turn the first SIGINT or SIGTERM into `stopping()`, the second into KeyboardInterrupt, once Open3D is not just being loaded."""
-        asked = 0
+        signals = 0
         again: list[threading.Timer] = []
 
         def handler(number: int, frame: FrameType | None) -> None:
-            nonlocal asked
-            asked += 1
-            if asked > 1:
+            nonlocal signals
+            signals += 1
+            if signals > 1:
                 if not _loading("open3d"):
                     raise KeyboardInterrupt
                 later()
@@ -101,8 +101,8 @@ class ConsoleProgress(Progress):
             self.say(STOPPING)
 
         def unraisable(lost: sys.UnraisableHookArgs) -> None:
-            # Python drops what is raised in `__del__` and in callbacks of C code; the wish to quit is told again a moment later.
-            if asked > 1 and issubclass(lost.exc_type, KeyboardInterrupt):
+            # Python drops what is raised in `__del__` and in callbacks of C code; the interrupt is raised again a moment later.
+            if signals > 1 and issubclass(lost.exc_type, KeyboardInterrupt):
                 later()
             else:
                 hook(lost)
@@ -123,7 +123,7 @@ class ConsoleProgress(Progress):
             raise
         except Exception as error:
             # A library that is interrupted while it loads answers with an error of its own (Open3D: ImportError).
-            if asked > 1:
+            if signals > 1:
                 raise KeyboardInterrupt from error
             raise
         finally:

@@ -6,13 +6,17 @@ from collections.abc import Iterable
 from dataclasses import asdict, dataclass, field, replace
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
 from fieldfuse import memory
 from fieldfuse.camera import Array
+from fieldfuse.capture.convert import all_converted, stored_cameras
+from fieldfuse.capture.select import SELECTED
+from fieldfuse.capture.types import Capture
 from fieldfuse.errors import InputError
+from fieldfuse.export.cameras import write_cameras
 from fieldfuse.export.surface import Originals, at_most, surface_of_field, whole_mesh
 from fieldfuse.files import write_json
 from fieldfuse.memory import require_pictures
@@ -24,11 +28,8 @@ from fieldfuse.pipelines.schemas import read_export_facts
 from fieldfuse.pipelines.stages import CollectingStage
 from fieldfuse.pipelines.surfaces import put_points
 from fieldfuse.pipelines.textured import TEXTURED, put_textured
+from fieldfuse.poses.result import PoseResult
 from fieldfuse.tone import exposed
-
-if TYPE_CHECKING:
-    from fieldfuse.capture.types import Capture
-    from fieldfuse.poses.result import PoseResult
 
 MESHES = ("ply", "obj", "glb")  # as `export.formats` has them
 TEXTURE = "texture"
@@ -202,11 +203,6 @@ def put_cameras(folder: Path, poses: PoseResult, posed: Capture, points: Array |
         points, colours: (P, 3) of a surface in the input's frame, for poses that came without points: programs that start from points
             need some.
     """
-    from fieldfuse.capture.convert import all_converted
-    from fieldfuse.capture.select import SELECTED
-    from fieldfuse.capture.stored import stored_cameras
-    from fieldfuse.export.cameras import write_cameras
-
     made_here = SELECTED in posed.extra or all_converted(posed)  # then the images lie in the run's folder
     root = posed.frames[0].image.parent.parent if made_here else posed.root
     # A capture that is reached through a link has its images where the link leads.

@@ -7,12 +7,15 @@ from collections.abc import Sequence
 from dataclasses import asdict, dataclass, replace
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
 from fieldfuse import steps
+from fieldfuse.config import FitSettings
 from fieldfuse.errors import InputError
+from fieldfuse.evaluation.pictures import depth_picture, depth_range
+from fieldfuse.evaluation.score import nearest_image_scores, score_views, seen_share, training_psnr
 from fieldfuse.files import fingerprint, write_json
 from fieldfuse.memory import require_scores
 from fieldfuse.pipelines.job import Job
@@ -21,14 +24,15 @@ from fieldfuse.pipelines.rendered import Pictures, to_picture, write_png
 from fieldfuse.pipelines.schemas import EVALUATION, NOTES, TIMELINE, Matched, Network, read_checked
 from fieldfuse.pipelines.stages import EndlessStage, Stage, StoredStage
 from fieldfuse.pipelines.surfaces import pictures_stage, render_views, views_for_fit
+from fieldfuse.render.field import Field
+from fieldfuse.render.image import make_renderer, render_view
+from fieldfuse.stereo.transients import LeftOut, load_left_out, save_left_out
 from fieldfuse.tone import exposed
-
-if TYPE_CHECKING:
-    from fieldfuse.config import FitSettings
-    from fieldfuse.render.field import Field
-    from fieldfuse.stereo.transients import LeftOut
-    from fieldfuse.training.fit import FitResult
-    from fieldfuse.training.from_network import Inference
+from fieldfuse.training.finer_colours import finer_colours
+from fieldfuse.training.fit import Begin, FitResult
+from fieldfuse.training.from_network import Inference
+from fieldfuse.training.guided import fit_guided
+from fieldfuse.training.network_start import network_start
 
 PREVIEW = "preview.png"
 DIRECT = "direct.safetensors"  # the finished field of direct inference where another one is the result
@@ -99,8 +103,6 @@ def starting_field(job: Job, ready: Prepared) -> NetworkField | None:
 
 def make_network_field(job: Job, ready: Prepared) -> NetworkField:
     """The stage `network`: direct inference, with a preview that is renewed as key frames come in."""
-    from fieldfuse.render.field import Field
-
     settings, views, scene = job.settings, ready.views, ready.scene
     path, about = job.folder / "network.safetensors", job.folder / "network.json"
     weights = steps.require_weights(settings)
@@ -159,9 +161,6 @@ def preview(inference: Inference, frame: int) -> Any:
     """(H, 3 · W, 3) uint8: the newest key frame's photo, the field of all key frames so far from there, and its depth."""
     import cv2
 
-    from fieldfuse.evaluation.pictures import depth_picture, depth_range
-    from fieldfuse.render.image import make_renderer, render_view
-
     camera, photo = inference.train.intrinsics[frame], inference.train.images[frame]
     shrink = min(1.0, PREVIEW_SIDE / max(camera.width, camera.height))
     camera = camera.scaled(max(1, round(shrink * camera.width)), max(1, round(shrink * camera.height)))
@@ -175,8 +174,6 @@ def preview(inference: Inference, frame: int) -> Any:
 
 def direct_result(job: Job, ready: Prepared, network: NetworkField) -> Field:
     """What direct inference gives, made of the stage `network`: colours are looked up again if the settings have it so."""
-    from fieldfuse.training.finer_colours import finer_colours
-
     if not job.settings.network.recolour:
         return network.field
     return finer_colours(network.field, ready.views, ready.scene.median_depth, job.progress, job.settings.engine)
@@ -189,11 +186,6 @@ def fit_radiance_field(job: Job, ready: Prepared, network: NetworkField | None, 
         network: the start of the fit, and the result itself without fine-tuning; None: the start is classical.
         go_on: the field that the folder has is the start, and the budget is for what is added.
     """
-    from fieldfuse.render.field import Field
-    from fieldfuse.stereo.transients import load_left_out, save_left_out
-    from fieldfuse.training.fit import Begin
-    from fieldfuse.training.guided import fit_guided
-    from fieldfuse.training.network_start import network_start
     from fieldfuse.volume.grid import host_for
 
     settings, scene, folder = job.settings, ready.scene, job.folder
@@ -269,9 +261,6 @@ def finished_field(job: Job, ready: Prepared) -> Fitted:
 
 def render_test_views(job: Job, ready: Prepared, field: Field) -> Pictures:
     """The field's renders at the held-out views."""
-    from fieldfuse.evaluation.score import training_psnr
-    from fieldfuse.render.image import make_renderer, render_view
-
     views = ready.views
 
     def make() -> Pictures:
@@ -286,8 +275,6 @@ def render_test_views(job: Job, ready: Prepared, field: Field) -> Pictures:
 
 def render_network_views(job: Job, ready: Prepared, network: NetworkField, keep: bool = False) -> Pictures:
     """What direct inference gives at the held-out views, before anything was fitted; `keep`: its field becomes the file `DIRECT`."""
-    from fieldfuse.render.image import make_renderer, render_view
-
     def make() -> Pictures:
         begin = time.monotonic()
         field = direct_result(job, ready, network)
@@ -312,8 +299,6 @@ def render_network_views(job: Job, ready: Prepared, network: NetworkField, keep:
 
 def score_pictures(job: Job, ready: Prepared, pictures: dict[str, Pictures]) -> dict[str, Any]:
     """The same metrics for field and TSDF, beside those of the nearest training image."""
-    from fieldfuse.evaluation.score import nearest_image_scores, score_views, seen_share
-
     path, views = job.folder / "evaluation.json", ready.views
 
     def make() -> dict[str, Any]:

@@ -98,10 +98,10 @@ class RunFolder:
             self._unlock()
 
     def _take_back(self) -> None:
-        """Remove what says that a run is here, and folders made for it, where the input was refused before anything else was written."""
+        """Remove what marks the folder as a run's, and folders made for it, where the input was refused before anything was written."""
         if self._held_run:
             return
-        with suppress(OSError):  # the refusal is what has to be told
+        with suppress(OSError):  # the refusal is what matters
             if not self._results():
                 remove(self.path / RUN)
                 remove(self.path / LOCK)
@@ -155,7 +155,7 @@ class RunFolder:
                 temporary.write_bytes(self._before)
 
     def about(self) -> dict[str, Any]:
-        """What run.json says.
+        """The content of run.json.
 
         Raises:
             InputError: the folder holds no run, or its run.json is damaged.
@@ -178,7 +178,7 @@ def command_line() -> str:
 
 
 def failed_write(error: Exception) -> bool:
-    """True for a full disk or a folder that may not be written, however a library says it."""
+    """True for a full disk or a folder that may not be written, however a library words it."""
     if isinstance(error, Interrupted):
         return False
     if isinstance(error, OSError) and error.errno in WRITE_ERRORS:

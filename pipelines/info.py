@@ -55,10 +55,10 @@ def info(
 def source_facts(source: Path, fast: bool, quiet: bool) -> dict[str, Any]:
     """Facts of a capture; with `fast` no pixel is decoded."""
     from fieldfuse.capture import open_capture
-    from fieldfuse.capture.beside import unused
     from fieldfuse.capture.checks import check_capture
+    from fieldfuse.capture.photos import unused
     from fieldfuse.pipelines.console import make_progress
-    from fieldfuse.pipelines.summary import describe_capture
+    from fieldfuse.pipelines.source import describe_capture
     from fieldfuse.poses.check_given import best_fitting
 
     capture, agreement = open_capture(source, choose=None if fast else best_fitting), None
@@ -88,7 +88,7 @@ def check_poses(capture: Capture, progress: Progress) -> tuple[str | None, list[
     """How well the poses that a capture brings fit its images, in a line, and what a run would warn of or refuse."""
     from fieldfuse.errors import PoseError
     from fieldfuse.poses.check_given import Agreement, check_given
-    from fieldfuse.poses.given import given_poses
+    from fieldfuse.poses.result import given_poses
 
     if capture.filmed or not capture.posed:
         return None, []

@@ -5,28 +5,31 @@ from __future__ import annotations
 from dataclasses import asdict, dataclass, replace
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
 from fieldfuse import steps
+from fieldfuse.capture.film import DEPTH
+from fieldfuse.capture.photos import with_unposed
+from fieldfuse.capture.prepare import limited
+from fieldfuse.capture.storage import capture_from_dict, capture_to_dict, load_views, save_views
+from fieldfuse.capture.types import Capture, Frame, Views
+from fieldfuse.effects.correct import Corrections
 from fieldfuse.errors import InputError
 from fieldfuse.files import read_json, write_json
 from fieldfuse.memory import require_file
+from fieldfuse.nerfusion.keyframes import KeyFrames
 from fieldfuse.pipelines.job import Job
 from fieldfuse.pipelines.schemas import Effects, read_checked
 from fieldfuse.pipelines.source import pixel_state, source_state
 from fieldfuse.pipelines.stages import InPlaceStage, Stage
+from fieldfuse.poses.check_given import VERSION as CHECKED
+from fieldfuse.poses.job import VERSION
+from fieldfuse.poses.points import Features
+from fieldfuse.poses.result import PoseResult
+from fieldfuse.poses.scene import Scene, describe_scene
 
-if TYPE_CHECKING:
-    from fieldfuse.capture.types import Capture, Frame, Views
-    from fieldfuse.effects.correct import Corrections
-    from fieldfuse.nerfusion.keyframes import KeyFrames
-    from fieldfuse.poses.points import Features
-    from fieldfuse.poses.result import PoseResult
-    from fieldfuse.poses.scene import Scene
-
-BEFORE = ("capture", "frames", "poses", "effects", "scene", "keyframes", "views")  # what every result stands on
 EFFECTS_FILE = "effects.json"
 
 
@@ -56,8 +59,6 @@ class Prepared:
 
 def prepare(job: Job, capture: Capture | None = None) -> Prepared:
     """Everything up to the views; `capture`: from `find_capture`, where that was called before."""
-    from fieldfuse.capture.subset import limited
-
     features: dict[str, Features] = {}  # of images by name, as they are extracted on the way
     capture = choose_frames(job, find_capture(job) if capture is None else capture)
     poses = find_camera_poses(job, capture, features)
@@ -72,9 +73,6 @@ def prepare(job: Job, capture: Capture | None = None) -> Prepared:
 
 def find_capture(job: Job) -> Capture:
     """Detect what the source is, read it, look at every image once (at those that `choose_frames` writes, then)."""
-    from fieldfuse.capture.photos import with_unposed
-    from fieldfuse.capture.storage import capture_from_dict, capture_to_dict
-
     path = job.folder / "capture.json"
     masks = job.settings.capture.masks
     state = source_state(job.source, job.folder.path)
@@ -97,8 +95,6 @@ def _written(path: Path, data: Any) -> Path:
 
 def choose_frames(job: Job, capture: Capture) -> Capture:
     """Images of a video or a film, and JPEGs of HEIF and mirrored images; other captures pass as they are."""
-    from fieldfuse.capture.storage import capture_from_dict, capture_to_dict
-
     if not steps.needs_frames(capture):
         return capture
     folder = job.folder / "frames"
@@ -126,8 +122,6 @@ def choose_frames(job: Job, capture: Capture) -> Capture:
 
 def in_folder(chosen: Capture, folder: Path) -> Capture:
     """The capture with what was written to a run's `frames` where that is now: the run's folder may have been moved."""
-    from fieldfuse.capture.film import DEPTH
-
     def here(frame: Frame) -> Frame:
         if not (frame.image.parent.name == folder.name and (folder / frame.image.name).is_file()):
             return frame
@@ -141,10 +135,6 @@ def in_folder(chosen: Capture, folder: Path) -> Capture:
 
 def find_camera_poses(job: Job, capture: Capture, features: dict[str, Features] | None = None) -> PoseResult:
     """Poses that the capture brings, as its images confirm them, or structure from motion; `features` gets those of images by name."""
-    from fieldfuse.poses.check_given import VERSION as CHECKED
-    from fieldfuse.poses.job import VERSION
-    from fieldfuse.poses.result import PoseResult
-
     settings, path = job.settings, job.folder / "poses.json"
     given = steps.uses_given_poses(capture, settings)
 
@@ -172,8 +162,6 @@ def find_camera_poses(job: Job, capture: Capture, features: dict[str, Features] 
 
 def find_effects(job: Job, posed: Capture) -> Corrections:
     """What is to be corrected; `effects.json` holds the evidence, the decisions and their seconds. With `effects: off` nothing is read."""
-    from fieldfuse.effects.correct import Corrections
-
     settings, path = job.settings, job.folder / EFFECTS_FILE
     if not steps.looks_for_effects(settings) or _did_without(job):
         return Corrections()
@@ -205,8 +193,6 @@ def _did_without(job: Job) -> bool:
 
 def measure_scene(job: Job, posed: Capture, features: dict[str, Features] | None = None) -> Scene:
     """Working frame, region of interest, depth range; `features`: of images by name, as far as they are known."""
-    from fieldfuse.poses.scene import Scene, describe_scene
-
     path = job.folder / "scene.json"
 
     def make() -> Scene:
@@ -233,8 +219,6 @@ def limit_of(job: Job) -> list[int] | None:
 
 def make_views(job: Job, posed: Capture, scene: Scene, corrections: Corrections | None = None) -> Views:
     """Images undistorted and resized once, in the working frame, test views marked, with `corrections` of colour."""
-    from fieldfuse.capture.views_file import load_views, save_views
-
     path, settings = job.folder / "views.safetensors", job.settings.capture
 
     def save(views: Views) -> list[Path]:
@@ -259,8 +243,6 @@ def make_views(job: Job, posed: Capture, scene: Scene, corrections: Corrections 
 
 def choose_keyframes(job: Job, scene: Scene, views: Views) -> KeyFrames:
     """Key frames among the training views and their neighbours, as indices into the training views; the file has their names."""
-    from fieldfuse.nerfusion.keyframes import KeyFrames
-
     path = job.folder / "keyframes.json"
     names = [views.names[int(index)] for index in np.flatnonzero(~np.asarray(views.test))]
 

@@ -3,10 +3,8 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Iterable
 from typing import Any
 
-from fieldfuse.pipelines.console import ConsoleProgress
 from fieldfuse.pipelines.exports import TEXTURE, Wish, export_results, require_originals
 from fieldfuse.pipelines.fields import (
     fit_radiance_field,
@@ -16,9 +14,8 @@ from fieldfuse.pipelines.fields import (
     score_pictures,
     uses_network,
 )
-from fieldfuse.pipelines.job import Job, open_job
-from fieldfuse.pipelines.options import Place
-from fieldfuse.pipelines.prepare import BEFORE, Prepared, choose_frames, find_camera_poses, find_capture, prepare
+from fieldfuse.pipelines.job import Job
+from fieldfuse.pipelines.prepare import Prepared, choose_frames, find_camera_poses, find_capture, prepare
 from fieldfuse.pipelines.summary import Results, put_report, summarise_poses
 from fieldfuse.pipelines.surfaces import fuse_tsdf, match_images
 from fieldfuse.pipelines.textured import TSDF_TEXTURE, texture_tsdf
@@ -28,20 +25,18 @@ RESULTS = ("tsdf", "field", "render", "export")
 FOR_FIELD = ("network", "direct")  # made with the field
 
 
-def run_job(
-    place: Place,
-    options: dict[str, Any],
-    goals: Iterable[str],
-    progress: ConsoleProgress,
-    *,
-    go_on: bool = False,
-    formats: list[str] | None = None,
-    total_budget: float | None = None,
-) -> dict[str, Any]:
-    """Open the run's folder and make `goals` (a part of `RESULTS`; none: camera poses alone) in it, with all that they need.
+def find_poses(job: Job) -> dict[str, Any]:
+    """Camera poses alone; answers a summary of them."""
+    capture = choose_frames(job, find_capture(job))
+    return summarise_poses(job, capture, find_camera_poses(job, capture))
+
+
+def reconstruct(job: Job, goals: frozenset[str], go_on: bool, formats: list[str] | None, total_budget: float | None) -> dict[str, Any]:
+    """Make the results named in `goals` (a part of `RESULTS`), with all that they need, and the report of all that is there.
+
+    Results that are not among the goals are left as they are, and stay in the report as long as they still fit.
 
     Args:
-        options: as for `open_job`.
         go_on: a field that the folder has is fitted further.
         formats: to be exported this time, whatever the settings are.
         total_budget: seconds for all of it.
@@ -49,20 +44,7 @@ def run_job(
     Returns:
         `report.json`.
     """
-    wanted = frozenset(goals)
-    with open_job(place, options, progress, BEFORE if wanted else ("capture", "frames")) as job:
-        if not wanted:
-            capture = choose_frames(job, find_capture(job))
-            return summarise_poses(job, capture, find_camera_poses(job, capture))
-        plan = None if total_budget is None else TotalBudget(total_budget)
-        return reconstruct(job, wanted, Wish(formats, wanted == {"export"}), plan, go_on)
-
-
-def reconstruct(job: Job, goals: frozenset[str], wish: Wish, plan: TotalBudget | None, go_on: bool) -> dict[str, Any]:
-    """Make the results named in `goals` and the report of all that is there; answers `report.json`.
-
-    Results that are not among the goals are left as they are, and stay in the report as long as they still fit.
-    """
+    plan = None if total_budget is None else TotalBudget(total_budget)
     start, stages = time.monotonic(), job.stages
     stages.trusted |= set(RESULTS) - goals
     if "tsdf" not in goals:
@@ -99,7 +81,7 @@ def reconstruct(job: Job, goals: frozenset[str], wish: Wish, plan: TotalBudget |
         if stages.usable("export") or ("export" in goals and not stages.stopped()):
             if plan is not None:
                 plan.choose_exports(job)
-            results.exported = export_results(job, ready, fitted, wish)
+            results.exported = export_results(job, ready, fitted, Wish(formats, goals == {"export"}))
     results.scores = score_pictures(job, ready, results.pictures)
     return put_report(job, ready, results, time.monotonic() - start)
 

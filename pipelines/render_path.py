@@ -21,8 +21,9 @@ from fieldfuse.pipelines.console import make_progress
 from fieldfuse.pipelines.fields import finished_field
 from fieldfuse.pipelines.job import open_job
 from fieldfuse.pipelines.pictures import camera_of, orbit_cameras, pictures
-from fieldfuse.pipelines.prepare import BEFORE, prepare
+from fieldfuse.pipelines.prepare import prepare
 from fieldfuse.pipelines.rendered import file_name, write_png
+from fieldfuse.pipelines.stages import BEFORE
 
 if TYPE_CHECKING:
     from fieldfuse.capture.types import Views

@@ -13,30 +13,35 @@ from fieldfuse.errors import InputError, brief
 from fieldfuse.files import read_json
 
 LARGEST = 1e300  # numbers beyond it cannot be computed with
-Number = Annotated[float, Field(gt=-LARGEST, lt=LARGEST)]
-Numbers = dict[str, Number | None]
+# Types are made while this is loaded, so that a type checker takes them for values.
+Many: Any = list
+ByName: Any = dict
+Number: Any = Annotated[float, Field(gt=-LARGEST, lt=LARGEST)]
+Maybe: Any = Number | None
+Numbers = ByName[str, Maybe]
 NO_OTHERS = object()
 
 
 def table(name: str, others: Any = NO_OTHERS, /, **keys: Any) -> Any:
     """The form of a JSON object: keys → types, (type, default) for keys that may be missing; `others`: type of all other keys."""
-    extra = {"__pydantic_extra__": dict[str, others]} if others is not NO_OTHERS else {}
+    extra = {"__pydantic_extra__": ByName[str, others]} if others is not NO_OTHERS else {}
     config = ConfigDict(strict=True, extra="allow" if extra else "forbid")
     base = type(name, (BaseModel,), {"__annotations__": extra, "__module__": __name__, "model_config": config})
-    return create_model(name, __base__=base, **{key: kind if isinstance(kind, tuple) else (kind, ...) for key, kind in keys.items()})
+    fields: Any = {key: kind if isinstance(kind, tuple) else (kind, ...) for key, kind in keys.items()}
+    return create_model(name, __base__=base, **fields)
 
 
-Maybe, Text = Number | None, (str | None, None)
-Mesh = table("Mesh", vertices=Number, triangles=Number, watertight=bool, components=Number, area=Number, bounds=list[list[Number]])
+Text = (str | None, None)
+Mesh = table("Mesh", vertices=Number, triangles=Number, watertight=bool, components=Number, area=Number, bounds=Many[Many[Number]])
 View = table("View", Number | str | None, index=Number, name=str, depth=(Numbers | None, None))
 Scores = table(
     "Scores",
     Number | bool | None,
-    per_view=(list[View], []),
+    per_view=(Many[View], []),
     depth=(Numbers | None, None),
     mesh=(Mesh | None, None),
     depth_from=Text,
-    on=(dict[str, Numbers], {}),
+    on=(ByName[str, Numbers], {}),
 )
 Wanted = table("Wanted", Maybe, decoder=Text, precision=Text)
 Setting = table("Setting", Maybe, decoder=Text, precision=Text, wanted=(Wanted | None, None))
@@ -46,8 +51,8 @@ Point = table(
     method=str,
     setting=Setting,
     stages=(Numbers | None, None),
-    load=(list[Maybe] | None, None),
-    axes=(list[str] | None, None),
+    load=(Many[Maybe] | None, None),
+    axes=(Many[str] | None, None),
     id=Text,
     variant=Text,
     error=Text,
@@ -69,14 +74,14 @@ Finding = table(
     note=(str, ""),
     seconds=(Number, 0),
     decided_by=(str, ""),
-    trial=(dict[str, Number], {}),
+    trial=(ByName[str, Number], {}),
 )
 LookedAt = table("LookedAt", Any, frames=Number, points=Number, points_seconds=(Number, 0))
 
-NOTES = list[str]
-EVALUATION = dict[str, Scores]
-TIMELINE = list[table("Moment", Number | str | None, seconds=Number, psnr=Maybe)]  # type: ignore[misc]
-Effects = table("Effects", effects=list[Finding], seconds=Number, corrections=(dict[str, Any], {}), looked_at=LookedAt)
+NOTES = Many[str]
+EVALUATION = ByName[str, Scores]
+TIMELINE = Many[table("Moment", Number | str | None, seconds=Number, psnr=Maybe)]
+Effects = table("Effects", effects=Many[Finding], seconds=Number, corrections=(ByName[str, Any], {}), looked_at=LookedAt)
 Matched = table("Matched", views=Number, pixels=Number, share=Number, bare=(Number, 0), seconds=Number)
 Network = table(
     "Network",
@@ -87,12 +92,12 @@ Network = table(
     first_preview_seconds=Number,
     resolution=Number,
 )
-ExportFacts = table("ExportFacts", mesh=Mesh | None, notes=(list[str], []), note=Text)
+ExportFacts = table("ExportFacts", mesh=Mesh | None, notes=(Many[str], []), note=Text)
 CompareScores = table(
-    "CompareScores", scores=EVALUATION, geometry=dict[str, Numbers] | None, seen_share=Maybe, matching=Numbers | None
+    "CompareScores", scores=EVALUATION, geometry=ByName[str, Numbers] | None, seen_share=Maybe, matching=Numbers | None
 )
-Tradeoff = table("Tradeoff", Any, rows=list[Point], command=str, unit=str | None, machine=dict[str, Number | str | None])
-MeasuredPoint = table("MeasuredPoint", key=str, crashed=bool, wall_seconds=Number, rows=list[Point])
+Tradeoff = table("Tradeoff", Any, rows=Many[Point], command=str, unit=str | None, machine=ByName[str, Number | str | None])
+MeasuredPoint = table("MeasuredPoint", key=str, crashed=bool, wall_seconds=Number, rows=Many[Point])
 
 
 @cache

@@ -1,4 +1,4 @@
-"""The capture that a run is of: the state of its files, by which a change is noticed, and its new place when it was moved."""
+"""The capture that a run is of: what it is, the state of its files, by which a change is noticed, and its new place when it was moved."""
 
 from __future__ import annotations
 
@@ -95,8 +95,25 @@ def picture_size(capture: Capture) -> tuple[int | None, int | None]:
         return first.intrinsics.width, first.intrinsics.height
     if capture.kind == "video":
         return capture.extra.get("width"), capture.extra.get("height")
-    from fieldfuse.capture.headers import read_bytes, read_header
+    from fieldfuse.capture.archive import read_bytes
+    from fieldfuse.capture.headers import read_header
 
     header = read_header(read_bytes(first.image), first.image)
     turned = header.orientation >= 5  # EXIF: the stored picture lies on its side
     return (header.height, header.width) if turned else (header.width, header.height)
+
+
+def describe_capture(capture: Capture) -> dict[str, Any]:
+    """The report's part `capture`."""
+    width, height = picture_size(capture)
+    return {
+        "kind": capture.kind,
+        "frames": len(capture.frames),
+        "width": width,
+        "height": height,
+        "posed": capture.posed,
+        "depth": sum(frame.depth is not None for frame in capture.frames),
+        "masks": sum(frame.mask is not None for frame in capture.frames),
+        "metric": capture.metric,
+        "extra": capture.extra,
+    }

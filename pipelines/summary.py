@@ -7,12 +7,18 @@ import time
 from dataclasses import dataclass, field, replace
 from datetime import UTC, datetime
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
 from fieldfuse import __version__
+from fieldfuse.camera import Array
+from fieldfuse.capture.types import Capture
 from fieldfuse.config import settings_dict
+from fieldfuse.effects.correct import apart
+from fieldfuse.evaluation.failure import failures
+from fieldfuse.evaluation.pictures import method_pictures, moving_pictures
+from fieldfuse.evaluation.report import report_data, write_report
 from fieldfuse.files import write_json
 from fieldfuse.pipelines.exports import put_cameras
 from fieldfuse.pipelines.fields import Fitted
@@ -21,15 +27,11 @@ from fieldfuse.pipelines.job import Job
 from fieldfuse.pipelines.prepare import EFFECTS_FILE, Prepared
 from fieldfuse.pipelines.rendered import Pictures, depth_step
 from fieldfuse.pipelines.schemas import Effects, read_checked
-from fieldfuse.pipelines.source import picture_size
+from fieldfuse.pipelines.source import describe_capture
 from fieldfuse.pipelines.textured import TSDF_TEXTURE
 from fieldfuse.pipelines.total_budget import TotalBudget
-
-if TYPE_CHECKING:
-    from fieldfuse.camera import Array
-    from fieldfuse.capture.types import Capture
-    from fieldfuse.poses.result import PoseResult
-    from fieldfuse.stereo.transients import LeftOut
+from fieldfuse.poses.result import PoseResult
+from fieldfuse.stereo.transients import LeftOut
 
 SEEN_BY_SFM = "poses were estimated from all images, the held-out ones included, so scores are slightly optimistic"
 MATCHED = (
@@ -50,22 +52,6 @@ SEES = {
 POSES = ("source", "registered", "total", "models", "missing", "seconds", "agreement")
 OPENED = {".html", ".ply", ".obj", ".glb", ".mp4", ".txt", ".json"}
 NO_TEST_VIEWS = "no image was held out, so there are no scores; give --holdout 8 to keep every 8th image for testing"
-
-
-def describe_capture(capture: Capture) -> dict[str, Any]:
-    """The report's part `capture`."""
-    width, height = picture_size(capture)
-    return {
-        "kind": capture.kind,
-        "frames": len(capture.frames),
-        "width": width,
-        "height": height,
-        "posed": capture.posed,
-        "depth": sum(frame.depth is not None for frame in capture.frames),
-        "masks": sum(frame.mask is not None for frame in capture.frames),
-        "metric": capture.metric,
-        "extra": capture.extra,
-    }
 
 
 def base_data(job: Job, capture: Capture, poses: PoseResult) -> dict[str, Any]:
@@ -157,10 +143,6 @@ class Results:
 
 def put_report(job: Job, ready: Prepared, results: Results, seconds: float) -> dict[str, Any]:
     """Write report.json and report.html; `seconds` is what this command took so far, reused stages count as they took."""
-    from fieldfuse.evaluation.failure import failures
-    from fieldfuse.evaluation.pictures import method_pictures, moving_pictures
-    from fieldfuse.evaluation.report import report_data, write_report
-
     began, plan, scene, views = time.monotonic(), results.plan, ready.scene, ready.views
     budget = None if plan is None else plan.report(job)
     fitted, exported, scores = results.fitted, results.exported, results.scores
@@ -251,15 +233,13 @@ def depth_offset(ready: Prepared) -> list[str]:
 
 def _apart(capture: Capture, some: Array, others: Array) -> tuple[str, str]:
     """How far poses (N, 4, 4) lie from others in the median, and how far they are turned, in words."""
-    from fieldfuse.effects.correct import apart
-
     way, turn = apart(some, others)
     length = f"{100 * np.median(way):.1f} cm" if capture.metric else f"{np.median(way):.3g} of the capture's units"
     return length, f"{np.median(turn):.2f}°"
 
 
 def effects_warnings(job: Job) -> list[str]:
-    """What a user has to know: effects that are there and cannot be corrected."""
+    """What a user has to be aware of: effects that are there and cannot be corrected."""
     part = effects_part(job, None)
     if part is None:
         return []

@@ -11,7 +11,10 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from fieldfuse.camera import Array, Intrinsics, Similarity
+from fieldfuse.capture.types import Views
 from fieldfuse.errors import InputError
+from fieldfuse.evaluation.compare_truth import find_truth, true_depths
 from fieldfuse.export.surface import whole_mesh
 from fieldfuse.memory import require_pictures
 from fieldfuse.pipelines.job import Job
@@ -19,12 +22,13 @@ from fieldfuse.pipelines.prepare import Prepared
 from fieldfuse.pipelines.rendered import Picture, Pictures, depth_steps, load_pictures, save_pictures, to_picture, write_pngs
 from fieldfuse.pipelines.source import pixel_state
 from fieldfuse.pipelines.stages import Stage, StoredStage
+from fieldfuse.stereo.fast_mvs import with_depths
+from fieldfuse.stereo.maps import load_stereo, save_stereo
+from fieldfuse.stereo.match import StereoDepth, stereo_depths
+from fieldfuse.stereo.plane_completion import continued
 from fieldfuse.tone import exposed
 
 if TYPE_CHECKING:
-    from fieldfuse.camera import Array, Intrinsics, Similarity
-    from fieldfuse.capture.types import Views
-    from fieldfuse.stereo.match import StereoDepth
     from fieldfuse.tsdf.mesh import Mesh
     from fieldfuse.tsdf.volume import Points, TsdfVolume
 
@@ -36,10 +40,6 @@ def match_images(job: Job, ready: Prepared) -> list[StereoDepth]:
         InputError: the images cannot be matched.
         Interrupted: the user asked to stop.
     """
-    from fieldfuse.stereo.maps import load_stereo, save_stereo
-    from fieldfuse.stereo.match import stereo_depths
-    from fieldfuse.stereo.plane_completion import continued
-
     path = job.folder / "stereo" / "depths.safetensors"
     scene, training = ready.scene, ready.training
 
@@ -67,8 +67,6 @@ def views_for_fit(job: Job, ready: Prepared) -> tuple[Views, list[str]]:
         InputError: the images are to be matched, and cannot be.
         Interrupted: the user asked to stop.
     """
-    from fieldfuse.stereo.fast_mvs import with_depths
-
     views = ready.views
     wanted = job.settings.fit.depth_from if job.settings.fit.depth > 0 else "off"
     if wanted == "off":
@@ -86,9 +84,6 @@ def exact_depths(ready: Prepared) -> list[StereoDepth]:
     Raises:
         InputError: a training image has none.
     """
-    from fieldfuse.evaluation.compare_truth import find_truth, true_depths
-    from fieldfuse.stereo.match import StereoDepth
-
     posed, views, truth = ready.posed, ready.views, find_truth(ready.posed)
     training = np.flatnonzero(~views.test)
     depths = [] if truth is None else true_depths(truth, posed, views, training, ready.scene.working_from_input.scale)

@@ -2,31 +2,32 @@
 
 Decided step by step, each time from what is known by then: pictures when the capture is known, the fit's seconds and its finest lattice
 when everything before it is done, the exports when the field can be rendered. What the machine's self-test takes, which is made once and
-has most of the compiling in it, comes on top: within the seconds asked for it would leave a first run next to none for its fit.
+has most of the compiling in it, comes on top: within the seconds given it would leave a first run next to none for its fit.
 """
 
 from __future__ import annotations
 
 import time
 from dataclasses import asdict, replace
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import psutil
 
-from fieldfuse.config import EXPORTS, settings_dict
+from fieldfuse.capture.convert import to_convert
+from fieldfuse.capture.prepare import held_out
+from fieldfuse.capture.types import Capture
+from fieldfuse.config import EXPORTS, Settings, settings_dict
 from fieldfuse.errors import FieldfuseError
 from fieldfuse.evaluation import budget as model
+from fieldfuse.evaluation.budget_probe import self_test
 from fieldfuse.files import fingerprint, read_json, write_json
 from fieldfuse.pipelines.exports import TEXTURE
+from fieldfuse.pipelines.job import Job
 from fieldfuse.pipelines.pictures import PAGE
+from fieldfuse.pipelines.prepare import Prepared
 from fieldfuse.pipelines.source import picture_size
 from fieldfuse.pipelines.textured import TSDF_TEXTURE
-
-if TYPE_CHECKING:
-    from fieldfuse.capture.types import Capture
-    from fieldfuse.config import Settings
-    from fieldfuse.pipelines.job import Job
-    from fieldfuse.pipelines.prepare import Prepared
+from fieldfuse.training.start import MARGIN, ROOM_MARGIN, finest_resolution, make_space, worth_a_level
 
 FILE = "plan.json"
 LONGEST_START = 60.0  # seconds; a process that is older was not started for this command
@@ -50,7 +51,7 @@ class TotalBudget:
     choice: model.Choice
 
     def __init__(self, seconds: float) -> None:
-        self.asked = seconds
+        self.target = seconds
         started = time.time() - psutil.Process().create_time()
         self._began = time.monotonic() - (started if started < LONGEST_START else 0.0)
         self.predicted: dict[str, float] = {}
@@ -63,8 +64,6 @@ class TotalBudget:
 
     def choose_pictures(self, job: Job, capture: Capture) -> None:
         """Decide picture size and a video's frames; predict every stage."""
-        from fieldfuse.evaluation.budget_probe import self_test
-
         settings = job.settings
         threads = settings.threads or psutil.cpu_count() or 1
         self.name = model.signature(threads, settings.device)
@@ -88,24 +87,24 @@ class TotalBudget:
         if kept is not None:
             self.choice, self.again = kept, True
         else:
-            self.choice = model.choose(self.speed, self.work, self.asked - self.elapsed(), settings.capture.max_frames)
+            self.choice = model.choose(self.speed, self.work, self.target - self.elapsed(), settings.capture.max_frames)
             self.choice.effects = self.work.effects
         settings.capture.image_size = self.choice.image_size
         if self.choice.max_frames is not None:
             settings.capture.max_frames = self.choice.max_frames
         before = self.elapsed() - job.stages.records["capture"].seconds * (not job.stages.cached["capture"])
         parts = model.predict(self.speed, self.work, self.choice)
-        parts["export"] = self._for_exports(job, self.asked - before - sum(parts.values()))
+        parts["export"] = self._for_exports(job, self.target - before - sum(parts.values()))
         parts["start"] = before
-        parts["fit"] = model.fit_seconds(self.asked, 0.0, sum(parts.values()))
+        parts["fit"] = model.fit_seconds(self.target, 0.0, sum(parts.values()))
         self.predicted = parts
 
     def _decide_effects(self, settings: Settings, kept: model.Choice | None) -> None:
-        """Looking for them is left out, unless some are asked for by name, when it would take most of so short a run."""
+        """Looking for them is left out, unless settings name some, when it would take most of so short a run."""
         if not self.work.effects or settings.effects.on:
             return
         looking = self.speed.seconds("effects", model.effects_work(self.work))
-        wanted = looking <= model.EFFECTS_SHARE * self.asked if kept is None or kept.effects is None else kept.effects
+        wanted = looking <= model.EFFECTS_SHARE * self.target if kept is None or kept.effects is None else kept.effects
         if not wanted:
             settings.effects.mode = "off"
             self.work = replace(self.work, effects=False)
@@ -113,7 +112,7 @@ class TotalBudget:
     @property
     def _least_fit(self) -> float:
         """Seconds that a fit should have: textures, then the page to walk through, are left out of a run in which they would take them."""
-        return min(model.FIT_SHARE * self.asked, model.ENOUGH)
+        return min(model.FIT_SHARE * self.target, model.ENOUGH)
 
     def _left_out_early(self, extra: str, kept: model.Choice | None) -> bool:
         """Whether it is already known now that this is left out: an earlier run decided so, or the TSDF, which is made before the field,
@@ -121,7 +120,7 @@ class TotalBudget:
         if kept is not None:
             return getattr(kept, extra) is False
         early = extra == TEXTURE and self.work.depth
-        return early and model.left_for_fit(self.speed, self.work, self.asked - self.elapsed()) < self._least_fit
+        return early and model.left_for_fit(self.speed, self.work, self.target - self.elapsed()) < self._least_fit
 
     def _leave_out(self, settings: Settings, extra: str) -> None:
         """Exports are made without it."""
@@ -135,8 +134,6 @@ class TotalBudget:
 
     def choose_fit(self, job: Job, ready: Prepared) -> None:
         """Decide the fit's seconds and its finest lattice from what is left, and whether meshes get textures and the field its page."""
-        from fieldfuse.training.start import worth_a_level
-
         if not self.again:
             for extra in (TEXTURE, PAGE) if self.all_wanted else ():
                 if getattr(self.work, extra) and self._left(job) < self._least_fit:
@@ -147,7 +144,7 @@ class TotalBudget:
             possible = model.resolution_for(self.choice.fit_seconds, pace, finest(job, ready))
             self.choice.resolution = possible if job.settings.field.resolution is not None else worth_a_level(possible)
         job.settings.fit.budget = self.choice.fit_seconds
-        job.settings.fit.passes = None  # so many seconds were asked for
+        job.settings.fit.passes = None  # the budget counts
         job.settings.field.resolution = self.choice.resolution
 
     def choose_exports(self, job: Job) -> None:
@@ -178,7 +175,7 @@ class TotalBudget:
             export.formats = [name for name in export.formats if name != "video"]
 
     def report(self, job: Job) -> dict[str, Any]:
-        """The report's part `budget`: seconds asked for, predicted and real, in all and by stage, and what was chosen."""
+        """The report's part `budget`: seconds given, predicted and real, in all and by stage, and what was chosen."""
         real = {record.name: record.seconds for record in job.stages.records.values()}
         names = {**dict.fromkeys(self.predicted), **dict.fromkeys(name for name in real if name not in ("field", "keyframes"))}
         shown = {
@@ -186,7 +183,7 @@ class TotalBudget:
             for name in names
         }
         return {
-            "asked_seconds": self.asked,
+            "asked_seconds": self.target,
             "predicted_seconds": _round(sum(self.predicted.values())),
             "real_seconds": _round(self.elapsed()),
             "self_test_seconds": _round(self.self_test),
@@ -210,7 +207,7 @@ class TotalBudget:
             f"Of the {told['asked_seconds']:g} s asked for, {told['predicted_seconds']:.0f} s were predicted and"
             f" {told['real_seconds']:.0f} s spent until this page was written; chosen: {', '.join(parts)}."
             + (BESIDES.format(told["self_test_seconds"]) if told.get("self_test_seconds") else "")
-            + (TOO_FEW.format(told["predicted_seconds"]) if told["predicted_seconds"] > (1 + model.AGREES) * self.asked else "")
+            + (TOO_FEW.format(told["predicted_seconds"]) if told["predicted_seconds"] > (1 + model.AGREES) * self.target else "")
         )
 
     def finish(self, job: Job, report_seconds: float) -> dict[str, Any]:
@@ -230,7 +227,7 @@ class TotalBudget:
             made = told["stages"].get("export", {}).get("real")
             if made and self.export_planned > WORTH_LEARNING:
                 self.speed.learn("export", self.export_planned, made)
-            if abs(told["real_seconds"] - self.asked) > 2 * model.AGREES * self.asked:
+            if abs(told["real_seconds"] - self.target) > 2 * model.AGREES * self.target:
                 model.remember(self.name, None)  # so far off that the machine must have changed: measured again next time
             else:
                 model.remember(self.name, self.speed)
@@ -249,7 +246,7 @@ class TotalBudget:
 
     def _learn_effects(self, job: Job, real: float | None) -> None:
         """Looking for effects takes less when none is corrected: what is learnt is what a picture takes. Where all were looked at, and none
-        was corrected after all, only the seconds tell."""
+        was corrected after all, only the seconds count."""
         path = job.folder / "effects.json"
         if not real or real < WORTH_LEARNING or not path.is_file():
             return
@@ -260,7 +257,7 @@ class TotalBudget:
 
     def _before(self, job: Job, *later: str) -> float:
         """Seconds that are left before these stages must begin."""
-        return self.asked - self.elapsed() - sum(self.predicted.get(stage, 0.0) for stage in later) * self._pace(job)
+        return self.target - self.elapsed() - sum(self.predicted.get(stage, 0.0) for stage in later) * self._pace(job)
 
     def _pace(self, job: Job) -> float:
         """How much slower than predicted the stages were so far; other work on the machine slows the rest, too."""
@@ -270,7 +267,7 @@ class TotalBudget:
         return min(max((real + model.STEADY) / (predicted + model.STEADY), 0.5), 3.0)
 
     def _keep(self, job: Job) -> None:
-        kept = {"asked": self.asked, "source": str(job.source), "given": self.given, "choice": self.choice.to_dict()}
+        kept = {"asked": self.target, "source": str(job.source), "given": self.given, "choice": self.choice.to_dict()}
         write_json(job.folder / FILE, kept)
 
     def _kept(self, job: Job) -> model.Choice | None:
@@ -280,7 +277,7 @@ class TotalBudget:
             return None
         try:
             kept = read_json(path)
-            if (kept["asked"], kept["source"], kept["given"]) == (self.asked, str(job.source), self.given):
+            if (kept["asked"], kept["source"], kept["given"]) == (self.target, str(job.source), self.given):
                 return model.Choice.of(kept["choice"])
         except (FieldfuseError, KeyError, TypeError, ValueError):
             pass
@@ -293,9 +290,6 @@ def _round(value: float | None) -> float | None:
 
 def work_of(capture: Capture, settings: Any) -> model.Work:
     """What the capture asks for, from what its headers say."""
-    from fieldfuse.capture.convert import to_convert
-    from fieldfuse.capture.prepare import held_out
-
     width, height = picture_size(capture)
     video = capture.filmed
     frames = settings.capture.max_frames if video else len(capture.frames)
@@ -329,8 +323,6 @@ def work_of(capture: Capture, settings: Any) -> model.Work:
 
 def finest(job: Job, ready: Prepared) -> int:
     """The lattice that a fit would end at without a budget."""
-    from fieldfuse.training.start import MARGIN, ROOM_MARGIN, finest_resolution, make_space
-
     settings, scene, views = job.settings.field, ready.scene, ready.views
     if settings.resolution is not None:
         return settings.resolution

@@ -99,8 +99,7 @@ def open_ground(folder: Path, settings: Settings, share: float) -> Ground:
     Raises:
         InputError: a stage's file is missing or damaged.
     """
-    from fieldfuse.capture.storage import capture_from_dict
-    from fieldfuse.capture.views_file import load_views
+    from fieldfuse.capture.storage import capture_from_dict, load_views
     from fieldfuse.evaluation.compare_truth import find_truth, true_depths
     from fieldfuse.poses.result import PoseResult
     from fieldfuse.poses.scene import Scene
@@ -321,7 +320,7 @@ def row_of(ground: Ground, spec: dict[str, Any], made: Made) -> dict[str, Any]:
 def main(path: str) -> int:
     """Measure the job in the file, write its answer beside it; 0 when there is one."""
     from fieldfuse.evaluation.report import plain
-    from fieldfuse.poses.worker import die_with_parent
+    from fieldfuse.poses.child import die_with_parent
 
     die_with_parent()
     spec = read_json(path)

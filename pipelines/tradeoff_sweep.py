@@ -21,8 +21,9 @@ from fieldfuse.pipelines.console import ConsoleProgress
 from fieldfuse.pipelines.direct_field import weights_state
 from fieldfuse.pipelines.job import Job, open_job
 from fieldfuse.pipelines.options import Place
-from fieldfuse.pipelines.prepare import BEFORE, prepare
+from fieldfuse.pipelines.prepare import prepare
 from fieldfuse.pipelines.schemas import MeasuredPoint, read_checked
+from fieldfuse.pipelines.stages import BEFORE
 from fieldfuse.poses.child import log_tail, run_logged
 
 VERSION = 1  # raised when what a point measures changes

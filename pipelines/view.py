@@ -27,7 +27,8 @@ def view(
     from fieldfuse.pipelines.fields import finished_field
     from fieldfuse.pipelines.job import open_job
     from fieldfuse.pipelines.pictures import camera_of
-    from fieldfuse.pipelines.prepare import BEFORE, prepare
+    from fieldfuse.pipelines.prepare import prepare
+    from fieldfuse.pipelines.stages import BEFORE
     from fieldfuse.pipelines.viewer import Live, Shown, require_server
 
     require_server(host)

@@ -10,13 +10,26 @@ from fieldfuse.pipelines.options import Options, Place, bound_threads, show
 PAGE = "exports/field.html"
 
 
-def work(place: Place, options: Options, goals: Iterable[str], settings: dict[str, Any], **how: Any) -> None:
-    """Make `goals` in the run's folder and show the report's numbers; `how`: as `fieldfuse.pipelines.reconstruct.run_job` takes it."""
+def work(
+    place: Place,
+    options: Options,
+    goals: Iterable[str],
+    settings: dict[str, Any],
+    *,
+    go_on: bool = False,
+    formats: list[str] | None = None,
+    total_budget: float | None = None,
+) -> None:
+    """Make `goals` (none: camera poses alone) in the run's folder and show the report's numbers; see `reconstruct.reconstruct`."""
     bound_threads(settings)
     from fieldfuse.pipelines.console import make_progress, table_lines
-    from fieldfuse.pipelines.reconstruct import run_job
+    from fieldfuse.pipelines.job import open_job
+    from fieldfuse.pipelines.stages import BEFORE
 
-    data = run_job(place, settings, goals, make_progress(options.quiet), **how)
+    with open_job(place, settings, make_progress(options.quiet), BEFORE if goals else BEFORE[:2]) as job:
+        from fieldfuse.pipelines.reconstruct import find_poses, reconstruct  # torch and more, for which no refusal waits
+
+        data = reconstruct(job, frozenset(goals), go_on, formats, total_budget) if goals else find_poses(job)
 
     def lines() -> Iterator[str]:
         yield from table_lines(data)

@@ -14,6 +14,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
+import psutil
 from numpy.typing import NDArray
 
 from fieldfuse.errors import InputError
@@ -25,7 +26,6 @@ if TYPE_CHECKING:
 
 GIB = 2**30
 SPARE = 128 * 2**20  # left to everything else
-_MEMINFO, _STATUS = Path("/proc/meminfo"), Path("/proc/self/status")
 _CGROUP = Path("/sys/fs/cgroup")
 # Of control groups, second and first version: what is allowed, what is in use, and which part of it are files nobody looked at lately.
 _GROUPS = (
@@ -43,19 +43,16 @@ ROW_COPIES = 3  # of a field's values while it is baked: its own, sorted ones fo
 MESH_COPIES = 6  # of a mesh file's size in memory while meshes are compared: float64, a tree to search in, samples
 
 
-def available() -> int | None:
-    """Bytes that can still be had: what the machine has free, what a container allows, what RLIMIT_AS leaves; None where nobody tells."""
-    limits = []
-    with suppress(OSError, KeyError, ValueError):
-        limits.append(_kilobytes(_MEMINFO, "MemAvailable"))
+def available() -> int:
+    """Bytes that can still be had: what the machine has free, what a container allows, what RLIMIT_AS leaves."""
+    limits = [psutil.virtual_memory().available]
     for allowed, used, idle in _GROUPS:
         with suppress(OSError, ValueError):  # "max" where there is no limit
             limits.append(int((_CGROUP / allowed).read_text()) - int((_CGROUP / used).read_text()) + _idle_files(_CGROUP / used, idle))
-    with suppress(OSError, KeyError, ValueError):
-        most = resource.getrlimit(resource.RLIMIT_AS)[0]
-        if most != resource.RLIM_INFINITY:
-            limits.append(most - _kilobytes(_STATUS, "VmSize"))
-    return max(0, min(limits)) if limits else None
+    most = resource.getrlimit(resource.RLIMIT_AS)[0]
+    if most != resource.RLIM_INFINITY:
+        limits.append(most - psutil.Process().memory_info().vms)
+    return max(0, min(limits))
 
 
 def require(size: int, what: str, advice: str) -> None:
@@ -68,8 +65,8 @@ def require(size: int, what: str, advice: str) -> None:
         InputError: naming both numbers.
     """
     there = available()
-    if there is not None and size > there - SPARE:
-        raise InputError(f"{what} needs about {size / GIB:.1f} GB of memory and {max(there, 0) / GIB:.1f} GB is free; {advice}")
+    if size > there - SPARE:
+        raise InputError(f"{what} needs about {size / GIB:.1f} GB of memory and {there / GIB:.1f} GB is free; {advice}")
 
 
 def pixels(lens: Intrinsics) -> int:
@@ -133,8 +130,7 @@ def require_file(path: Path, what: str) -> None:
 
 def bounded(most: int, share: float = 0.5) -> int:
     """`most` bytes, or `share` of what is there when that is less: for work that makes do with what it is given."""
-    there = available()
-    return most if there is None else max(0, min(most, int(share * (there - SPARE))))
+    return max(0, min(most, int(share * (available() - SPARE))))
 
 
 def workers(wanted: int, each: int, what: str, advice: str) -> int:
@@ -144,8 +140,7 @@ def workers(wanted: int, each: int, what: str, advice: str) -> int:
         InputError: not for one; `what` and `advice` as for `require`.
     """
     require(each, what, advice)
-    there = available()
-    return wanted if there is None else max(1, min(wanted, (there - SPARE) // max(1, each)))
+    return max(1, min(wanted, (available() - SPARE) // max(1, each)))
 
 
 def pages(size: int) -> mmap.mmap | bytearray:
@@ -226,8 +221,3 @@ def _idle_files(used: Path, name: str) -> int:
         entries = dict(line.split(" ", 1) for line in (used.parent / "memory.stat").read_text(encoding="ascii").splitlines())
         return int(entries.get(name, 0))
     return 0
-
-
-def _kilobytes(path: Path, name: str) -> int:
-    entries = dict(line.split(":", 1) for line in path.read_text(encoding="ascii").splitlines() if ":" in line)
-    return int(entries[name].split()[0]) * 1024

@@ -164,6 +164,7 @@ FAULTS = (
         "reset gate left out",
         "skipped step",
         ("self.candidate(_beside(r * state, local)", "self.candidate(_beside(state, local)"),
+        ("self.candidate(_beside(r * h, v)", "self.candidate(_beside(h, v)"),
     ),
     fault(
         "update gate's count with the wrong sign",
@@ -174,6 +175,7 @@ FAULTS = (
         "key frames chosen when both are low",
         "wrong comparison",
         ("np.all((angle > min_parallax) | (common < max_overlap))", "np.all((angle > min_parallax) & (common < max_overlap))"),
+        ("> MIN_PARALLAX) | (common[i, chosen] < MAX_OVERLAP)", "> MIN_PARALLAX) & (common[i, chosen] < MAX_OVERLAP)"),
     ),
     fault(
         "depth likelihood's window",
@@ -183,9 +185,9 @@ FAULTS = (
     fault(
         "opacity loss pulls to zero",
         "wrong sign",
-        ("torch.where(solid, (1 - traced.opacity).square(), 0.0)", "torch.where(solid, traced.opacity.square(), 0.0)"),
+        ("solid, (1 - traced.opacity).square(), 0.0)", "solid, traced.opacity.square(), 0.0)"),
     ),
-    fault("warm-up off by one", "off by one", ("return asked.rate * (step + 1) / asked.warmup", "return asked.rate * step / asked.warmup")),
+    fault("warm-up off by one", "off by one", (".rate * (step + 1) / ", ".rate * step / ")),
     fault("DTU's volumes in millimetres", "wrong unit", ("MILLIMETRES = 1 / 200", "MILLIMETRES = 1 / 1000")),
     fault(
         "rays through pixel corners",
@@ -200,6 +202,7 @@ FAULTS = (
     fault(
         "background over everything",
         "skipped step",
+        ("colour = colour + (1 - opacity)[:, None] * field.background", "colour = colour + field.background[None]"),
         ("colour = shown.colour + (1 - shown.opacity)[:, None] * field.background", "colour = shown.colour + field.background[None]"),
     ),
     # Per-scene fit
@@ -230,6 +233,7 @@ FAULTS = (
     fault(
         "numba: weight of thin samples",
         "wrong sign",
+        ("tau * (ONE - tau * HALF * (ONE - tau * THIRD))", "tau * (ONE + tau * HALF * (ONE - tau * THIRD))"),
         ("return before * tau * (ONE - tau * HALF * (ONE", "return before * tau * (ONE + tau * HALF * (ONE"),
     ),
     fault(

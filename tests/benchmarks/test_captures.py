@@ -20,6 +20,7 @@ SHORT = ["--budget", "1", "--threads", "1", "--image-size", "64"]
 PAIRS = ["--set", "field.resolution=16", "--set", "init=classical"]
 
 
+@pytest.mark.slow
 def test_a_bad_capture_is_a_row_and_finished_runs_are_reused(tmp_path: Path, capsys: Capsys) -> None:
     make_room(tmp_path / "data" / "room", 10)
     (tmp_path / "data" / "broken").mkdir()

@@ -94,7 +94,7 @@ def test_switched_by_hand(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsy
     monkeypatch.setattr(effects_by_hand, "fit_with", fit)
     monkeypatch.setattr(effects_by_hand, "open_capture", lambda path: path)
     monkeypatch.setattr(effects_by_hand, "held_out", lambda capture, holdout: np.zeros(3, bool))
-    monkeypatch.setattr(effects_by_hand, "survey", lambda capture, *rest, **more: looks.append(capture) or "looked at")
+    monkeypatch.setattr(effects_by_hand, "diagnose", lambda capture, *rest, **more: looks.append(capture) or "looked at")
     command = ["effects_by_hand", tmp_path / "out", tmp_path / "a", tmp_path / "b", "--seconds", "2", "--image-size", "64"]
     answer = bench(capsys, *command, "--seeds", "2")
     assert answer.code == 0, answer.err

@@ -24,6 +24,7 @@ def room(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return folder
 
 
+@pytest.mark.slow
 def test_tables_of_few_views_go_on_where_they_stopped(room: Path, tmp_path: Path, capsys: Capsys) -> None:
     out = tmp_path / "table"
     command = ["few_views", room, "--out", out, "--budgets", "0.5", "--set", "field.resolution=32", "--set", "network.voxels=12"]

@@ -54,8 +54,8 @@ def test_memory_a_voxel() -> None:
     assert baked.bytes / baked.voxels < 70
     engine = NumbaEngine(field, sphere_pixels(16), threads=1)
     rows = len(field.density_rows)
-    assert engine.index.nbytes == rows * 8 and engine.marks.nbytes == len(field.occupied) * 2
-    assert engine.records.shape == (rows, CHANNELS + 2) and engine.records.itemsize == 2
+    assert engine.rows.index.nbytes == rows * 8 and engine.marks.nbytes == len(field.occupied) * 2
+    assert engine.rows.records.shape == (rows, CHANNELS + 2) and engine.rows.records.itemsize == 2
 
 
 def test_ratios_are_of_the_clock_that_is_asked_for() -> None:

@@ -1,4 +1,7 @@
-"""Evidence from simulated captures with known effects: found when it is there, not found when it is not, and of the right size."""
+"""Evidence of exposure and vignetting in simulated captures and made-up tracks: found when it is there, and of the right size.
+
+In one capture each hides some of the other, so they are judged together.
+"""
 
 from __future__ import annotations
 
@@ -7,11 +10,12 @@ import pytest
 
 from fieldfuse.effects.effect_specs import preset
 from fieldfuse.effects.evidence import without_points_and_frames
-from fieldfuse.effects.light import LightTracks, exposure_evidence, vignetting_evidence
+from fieldfuse.effects.light import BOTH, EXPOSURE, MARGIN, VIGNETTING, LightTracks, explain, exposure_evidence, spread, vignetting_evidence
 from fieldfuse.simulate.materials import TextureBank, texture_bank
 from tests.effects.filmed import FRAMES, Filmed, film_tracks
 
 SEEDS = (11, 12)
+MANY = 30  # frames of what is made up
 
 
 @pytest.fixture(scope="module")
@@ -68,13 +72,6 @@ def test_vignetting_is_found_and_measured(bank: TextureBank, seed: int, strength
     assert found.parameters["corner"] == pytest.approx(preset("vignetting", strength).corner, abs=0.06)
 
 
-def test_both_together(bank: TextureBank) -> None:
-    filmed = film_tracks(bank, SEEDS[0], ["exposure:strong", "vignetting:medium", "sensor_noise:medium"])
-    assert exposure_evidence(filmed.tracks, FRAMES).found
-    found = vignetting_evidence(filmed.tracks, FRAMES)
-    assert found.found and found.parameters["corner"] == pytest.approx(0.62, abs=0.08)
-
-
 def test_vignetting_is_not_taken_for_drift(bank: TextureBank) -> None:
     """Along a corridor points move outwards in every frame; with the vignetting that was found taken out, no drift is left."""
     filmed = film_tracks(bank, 32, ["vignetting:medium"], kind="corridor")
@@ -91,3 +88,50 @@ def test_too_little_to_tell_is_said(clean: list[Filmed]) -> None:
     few = LightTracks(tracks.linear[:5], tracks.frame[:5], tracks.point[:5], tracks.radius[:5])
     for found in (exposure_evidence(few, FRAMES), vignetting_evidence(few, FRAMES)):
         assert not found.found and "too few" in found.reason
+
+
+# ------------------------------------------------------------------------------------------- both together
+
+
+def wandering(stops: float, corner: float, noise: float, seed: int = 0) -> LightTracks:
+    """Points that wander over neighbouring pictures, which differ by `stops` and lose light to `corner`; `noise` stops an observation."""
+    rng = np.random.default_rng(seed)
+    points, long = 1500, 6
+    first = rng.integers(0, MANY - long + 1, points)
+    frame = (first[:, None] + np.arange(long)).ravel()
+    start, end = rng.uniform(-1, 1, (2, points, 1))
+    radius = np.abs(start + (end - start) * np.arange(long) / (long - 1)).ravel()
+    gain = rng.normal(0, stops, MANY)
+    light = rng.uniform(-4, -2.2, points).repeat(long) + gain[frame] + rng.normal(0, noise, len(frame))
+    light += np.log2((1 + (corner**-0.5 - 1) * radius**2) ** -2)
+    return LightTracks(np.exp2(light)[:, None] * np.ones(3), frame, np.arange(points).repeat(long), radius)
+
+
+def test_nothing_is_told_of_noise() -> None:
+    for seed in range(5):
+        assert not explain(wandering(0.0, 1.0, 0.12, seed), MANY).kept
+
+
+def test_each_alone_is_told() -> None:
+    assert explain(wandering(0.3, 1.0, 0.08), MANY).kept == {EXPOSURE}
+    found = explain(wandering(0.0, 0.35, 0.08), MANY)
+    assert found.kept == {VIGNETTING} and found.corner == pytest.approx(0.35, abs=0.03)
+
+
+def test_exposure_that_misses_its_margin_is_told_beside_vignetting() -> None:
+    """As in a real video of a can on a table, whose pictures get darker to the corners and whose exposure drifts."""
+    tracks = wandering(0.1, 0.4, 0.16)
+    before = spread(tracks)
+    drift = np.array(exposure_evidence(tracks, MANY).parameters["gain"])
+    exposed = spread(LightTracks(tracks.linear / drift[tracks.frame], tracks.frame, tracks.point, tracks.radius))
+    assert exposed > (1 - MARGIN[EXPOSURE]) * before
+    found = explain(tracks, MANY)
+    assert found.kept == {EXPOSURE, VIGNETTING}
+    assert found.after[EXPOSURE] == found.after[VIGNETTING] < (1 - BOTH) * before
+    assert found.after[EXPOSURE] > (1 - MARGIN[EXPOSURE]) * found.before[EXPOSURE]
+    assert found.corner == pytest.approx(0.4, abs=0.03)
+
+
+def test_vignetting_brings_no_gains_along() -> None:
+    for seed in range(5):
+        assert explain(wandering(0.02, 0.4, 0.12, seed), MANY).kept == {VIGNETTING}

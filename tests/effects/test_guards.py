@@ -14,11 +14,11 @@ from fieldfuse.camera import Array
 from fieldfuse.capture.types import Capture, Frame
 from fieldfuse.config import EffectsSettings
 from fieldfuse.effects import decide as module
-from fieldfuse.effects.adjust import LENS, POSES, ROWS
+from fieldfuse.effects.adjust import POSES, ROWS
 from fieldfuse.effects.correct import STOPS, Corrections, apart, beyond, beyond_depth, bounded_gains
 from fieldfuse.effects.decide import FEWEST_TRIED, TRIED, Decision, Trial, better, decide, tried_frames
 from fieldfuse.effects.diagnostics import Diagnostics, diagnose_tracks
-from fieldfuse.effects.light import EXPOSURE, VIGNETTING
+from fieldfuse.effects.light import EXPOSURE
 from fieldfuse.effects.refine import refined_poses
 from fieldfuse.effects.tracks import Tracks
 from tests.effects.seen import CAMERA, FRAMES, made
@@ -34,8 +34,7 @@ def far_off(poses: Array, given: Array) -> float:
 
 def test_held_out_frames_are_placed_right_beside_a_rolling_shutter() -> None:
     """Rows read one after the other explain the points of training frames; placed frames must not pay for it."""
-    true, seen = made(3, rows=0.4, pose_error=0.004), None
-    seen = made(3, rows=0.4, pose_error=0.004)
+    true, seen = made(3, rows=0.4), made(3, rows=0.4, pose_error=0.004)
     refined = refined_poses(seen, TRAIN, frozenset({POSES, ROWS}))
     given, after = apart(seen.poses, true.poses)[1], apart(refined.poses, true.poses)[1]
     assert after[~TRAIN].max() < 2 * max(after[TRAIN].max(), 0.2), (given, after)
@@ -206,8 +205,3 @@ def test_poses_that_place_nothing_are_not_used(walked: Walked, monkeypatch: pyte
     decisions, corrections, _ = decided((shaken, found), monkeypatch, {POSES: 1.0, EXPOSURE: 0.5})
     assert not decisions[POSES].on and decisions[POSES].decided_by == "check" and not corrections.poses
     assert "held-out frames cannot be placed" in decisions[POSES].note
-
-
-def test_lens_and_vignetting_are_switched_with_their_groups() -> None:
-    assert {LENS, POSES} <= set(module.WINS) and {EXPOSURE, VIGNETTING} <= set(module.WINS)
-    assert set(module.WINS) == {name for group in module.GROUPS for name in group}

@@ -74,7 +74,6 @@ def sweeps(views: int, planes: int, height: int, width: int, count: int) -> None
     plane_sweep.costs(list(whole), seen_by, inverses, rays, own, 8.0, 0.6)
     cost = torch.rand(height, width, planes).permute(2, 0, 1)
     costs = CostVolume(seen_by[views - 1], rays, inverses, 0.1, 0.01, cost)
-    plane_sweep.semi_global(cost, 0.1, 0.8)
     smoothing = 0.1, 0.8, 0.05
     table = plane_sweep.table(plane_sweep.smoothed_softmax(cost, *smoothing), 0.01, 2)
     depth, place = torch.rand(2 * height, width + 3), ((2 * height, 2 * width), [(0, 2 * height), (0.5, width)])

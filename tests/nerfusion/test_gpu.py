@@ -26,7 +26,7 @@ from fieldfuse.backends.triton import volumes as volumes_gpu
 from fieldfuse.nerfusion.block_conv import BlockConv3d, Prepared, block_conv3d
 from fieldfuse.nerfusion.cameras import all_blocks
 from fieldfuse.nerfusion.extras.cross_view_consistency import consistency, cross_view, own_estimate
-from fieldfuse.nerfusion.extras.matching import patch_descriptors, semi_global, smoothed_softmax
+from fieldfuse.nerfusion.extras.matching import patch_descriptors, smoothed_softmax
 from fieldfuse.nerfusion.extras.plane_sweep import _table, cost_volume, sweep_planes, to_probability
 from fieldfuse.nerfusion.fusion import Fusion, FusionOptions
 from fieldfuse.nerfusion.lattice import LatentVolume, Lattice, cells, rows_of
@@ -92,10 +92,9 @@ def forced(monkeypatch: pytest.MonkeyPatch) -> None:
 def test_matching(shape: tuple[int, int, int], monkeypatch: pytest.MonkeyPatch) -> None:
     cost = torch.rand(shape, generator=torch.Generator().manual_seed(0))
     off(monkeypatch)
-    smooth, likely = semi_global(cost), smoothed_softmax(cost)
+    likely = smoothed_softmax(cost)
     table = _table(likely, 0.1)
     forced(monkeypatch)
-    torch.testing.assert_close(semi_global(cost), smooth, atol=1e-6, rtol=0)
     torch.testing.assert_close(smoothed_softmax(cost), likely, atol=1e-5, rtol=0)
     made = _table(likely, 0.1)
     torch.testing.assert_close(made, table, atol=1e-5, rtol=0)

@@ -14,7 +14,8 @@ from fieldfuse.pipelines.console import make_progress
 from fieldfuse.pipelines.fields import fit_radiance_field, starting_field
 from fieldfuse.pipelines.job import open_job
 from fieldfuse.pipelines.options import Place, gather
-from fieldfuse.pipelines.prepare import BEFORE, choose_frames, find_capture, prepare
+from fieldfuse.pipelines.prepare import choose_frames, find_capture, prepare
+from fieldfuse.pipelines.stages import BEFORE
 from tests.capture.films import film
 from tests.pipelines.made import call, circle, shoot
 from tests.pipelines.short import ALONE, finished, stages

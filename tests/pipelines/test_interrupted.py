@@ -1,4 +1,4 @@
-"""Runs that are killed, stopped with Ctrl-C, or started twice in one folder."""
+"""Ctrl-C while a field is fitted, and while code is made from text; `tests/stability` stops and kills runs at every stage."""
 
 from __future__ import annotations
 
@@ -10,10 +10,8 @@ from pathlib import Path
 
 import pytest
 
-from fieldfuse.pipelines.console import STOPPING
-from fieldfuse.render.field import Field
-from tests.pipelines.made import CAMERA, Answer, call, environment, make_room
-from tests.pipelines.short import FAST, HUNG, report, stages, start, wait_for
+from tests.pipelines.made import call, environment, make_room
+from tests.pipelines.short import FAST, HUNG, report, stages, wait_for
 
 Capsys = pytest.CaptureFixture[str]
 # Of a fit that does not end by itself while a test looks at it; without matching steps begin at once.
@@ -24,28 +22,6 @@ def fitting(told: Path, *arguments: object) -> subprocess.Popen[str]:
     """`fieldfuse …` as a process of its own, which makes the file `told` when its fit is under way."""
     words = [sys.executable, "-m", "tests.pipelines.fitting", str(told), *map(str, arguments)]
     return subprocess.Popen(words, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, env=environment())
-
-
-def test_killed_at_several_moments_the_run_goes_on(tmp_path: Path, capsys: Capsys) -> None:
-    """Killed right after the capture, while the field is fitted, and after it; then left alone."""
-    make_room(tmp_path / "room", 9, True, CAMERA.scaled(48, 36))
-    out, told = tmp_path / "out", tmp_path / "fitting"
-    arguments = ["run", tmp_path / "room", "--out", out, *FAST]
-    moments = (out / "stages" / "capture.json", ()), (told, LONG), (out / "stages" / "field.json", ())
-    for moment, more in moments:
-        process = fitting(told, *arguments, *more)
-        wait_for(moment, process)
-        process.kill()
-        process.communicate()
-    answer = call(capsys, *arguments)
-    assert answer.code == 0, answer.err
-    data = report(out)
-    cached = stages(data)
-    assert cached["capture"] and cached["views"] and cached["field"]
-    assert call(capsys, "run", tmp_path / "room", "--out", tmp_path / "whole", *FAST).code == 0
-    for method in ("tsdf", "field"):
-        assert data["evaluation"][method]["psnr"] == pytest.approx(report(tmp_path / "whole")["evaluation"][method]["psnr"], abs=0.1)
-    assert not list(out.rglob(".tmp-*"))
 
 
 def test_ctrl_c_while_fitting_keeps_the_field_and_reports(tmp_path: Path, capsys: Capsys) -> None:
@@ -67,36 +43,6 @@ def test_ctrl_c_while_fitting_keeps_the_field_and_reports(tmp_path: Path, capsys
     assert not any("stopped early" in warning for warning in again["warnings"]) and not stages(again)["field"] and stages(again)["views"]
 
 
-def test_ctrl_c_before_the_field_says_how_to_go_on(tmp_path: Path) -> None:
-    make_room(tmp_path / "room", 60, depth=True)
-    process = start("run", tmp_path / "room", "--out", tmp_path / "out", *FAST)
-    wait_for(tmp_path / "out" / "run.json", process)
-    process.send_signal(signal.SIGINT)
-    out, err = process.communicate(timeout=HUNG)
-    assert process.returncode == 130, err
-    assert "same command again" in Answer(130, out, err).sentence()
-
-
-def test_ctrl_c_twice_ends_at_once(tmp_path: Path) -> None:
-    make_room(tmp_path / "room", 10)
-    process = fitting(tmp_path / "fitting", "run", tmp_path / "room", "--out", tmp_path / "out", *FAST, *LONG)
-    wait_for(tmp_path / "fitting", process)
-    process.send_signal(signal.SIGINT)
-    assert process.stderr is not None
-    while process.stderr.readline().strip() not in (STOPPING, ""):  # the first has been heard
-        pass
-    process.send_signal(signal.SIGINT)
-    _, err = process.communicate(timeout=HUNG)
-    assert process.returncode == 130  # after one alone there would be a report, and code 0
-    assert "Traceback" not in err
-    # A fit ends within a step of the first, so its stage may be whole by the time of the second; nothing after it is.
-    done = {path.stem for path in (tmp_path / "out" / "stages").glob("*.json")}
-    assert "views" in done and done.isdisjoint({"render", "export", "evaluate"})
-    assert not (tmp_path / "out" / "report.json").exists() and not (tmp_path / "out" / "exports").exists()
-    if "field" in done:
-        assert Field.load(tmp_path / "out" / "field.safetensors").voxels > 0
-
-
 def test_ctrl_c_while_code_is_made_from_text(tmp_path: Path) -> None:
     """Many imports do that. CPython then ends `python -m` by the signal, although the interrupt was caught."""
     (tmp_path / "interrupted.py").write_text(
@@ -108,15 +54,3 @@ def test_ctrl_c_while_code_is_made_from_text(tmp_path: Path) -> None:
     there = environment(PYTHONPATH=os.pathsep.join([str(tmp_path), str(Path(__file__).parents[2])]))
     answer = subprocess.run([sys.executable, "-m", "interrupted"], env=there, capture_output=True, text=True, timeout=HUNG)
     assert answer.returncode == 130 and answer.stderr == "fieldfuse: stopped\n" and answer.stdout == "tidied\n"
-
-
-def test_two_runs_in_one_folder(tmp_path: Path, capsys: Capsys) -> None:
-    make_room(tmp_path / "room", 10)
-    arguments = ["run", tmp_path / "room", "--out", tmp_path / "out", *FAST, *LONG]
-    process = start(*arguments)
-    wait_for(tmp_path / "out" / "stages" / "capture.json", process)
-    answer = call(capsys, *arguments)
-    process.kill()
-    process.communicate()
-    assert answer.code == 2
-    assert "another fieldfuse command" in answer.sentence()

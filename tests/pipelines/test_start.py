@@ -58,7 +58,7 @@ def test_unexpected_errors_leave_a_log_and_no_traceback(tmp_path: Path, capsys: 
     def fail(*_: object) -> None:
         raise RuntimeError("a bolt is loose")
 
-    monkeypatch.setattr("fieldfuse.poses.given.given_poses", fail)
+    monkeypatch.setattr("fieldfuse.poses.result.given_poses", fail)
     answer = call(capsys, "run", tmp_path / "room", "--out", tmp_path / "out", "--quiet")
     assert answer.code == 1
     assert "error.log" in answer.sentence() and "RuntimeError" in answer.sentence()

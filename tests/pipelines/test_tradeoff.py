@@ -107,7 +107,7 @@ def test_a_sweep_goes_on_where_it_stopped(tmp_path: Path, capsys: Capsys, monkey
     short = json.loads(call(capsys, *command, "--budget", "1").out)
     assert short["rows"] == [] and short["left_out"] == ["field-1s-seed0", "tsdf-seed0"]  # nothing fits into a second
     monkeypatch.setattr("fieldfuse.pipelines.tradeoff_sweep.run_child", surfaces_here)
-    monkeypatch.setattr("fieldfuse.poses.worker.die_with_parent", lambda: None)
+    monkeypatch.setattr("fieldfuse.poses.child.die_with_parent", lambda: None)
     monkeypatch.setattr("fieldfuse.evaluation.tradeoff_page.MEASURES", {"psnr": MEASURES["psnr"]})  # all plots: tests/evaluation
     answer = call(capsys, *command)
     assert answer.code == 0, answer.err

@@ -21,10 +21,9 @@ from fieldfuse.errors import PoseError
 from fieldfuse.export.cameras import write_colmap
 from fieldfuse.poses import check_given as module
 from fieldfuse.poses.check_given import LEAST_MATCHES, best_fitting, check_given, choose_images, same_poses
-from fieldfuse.poses.given import given_poses
 from fieldfuse.poses.mistakes import FILE_AXES, readings
 from fieldfuse.poses.points import Features
-from fieldfuse.poses.result import PoseResult
+from fieldfuse.poses.result import PoseResult, given_poses
 from fieldfuse.poses.two_view import deviation, find_matches
 from tests.conftest import shared_data
 from tests.poses.textured import CAMERA, arc, render

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from fieldfuse.camera import Array
-from fieldfuse.poses.features import sift
+from fieldfuse.poses.database import sift
 
 
 def blobs() -> tuple[Array, Array]:

@@ -66,6 +66,12 @@ def rotations(seed: int, count: int, degrees: float) -> list[np.ndarray]:
     return [cv2.Rodrigues(np.radians(degrees) * v / np.linalg.norm(v))[0] for v in random.standard_normal((count, 3))]
 
 
+WALL = [
+    pair(i, i + 1, homography=homography(r, 600, np.array([0.4, 0, 0.1]), np.array([0, 0, 1.0])).tolist())
+    for i, r in enumerate(rotations(2, 9, 5.0))
+]
+
+
 @settings(max_examples=30, deadline=None)
 @given(st.floats(300, 2000), st.floats(2, 25), st.integers(0, 1000), st.floats(0.01, 100))
 def test_turning_on_the_spot_is_recognised_at_any_zoom_and_scale_of_the_matrix(focal, degrees, seed, factor):
@@ -117,32 +123,24 @@ def test_a_model_that_moves_farther_than_its_pairs_tell_has_a_wrong_lens(moved, 
 
 def test_a_few_pictures_of_many_by_looser_rules_are_no_model_where_pairs_are_flat():
     turning = [pair(i, i + 1, homography=homography(r, 600).tolist()) for i, r in enumerate(rotations(1, 9, 8.0))]
-    wall = [
-        pair(i, i + 1, homography=homography(r, 600, np.array([0.4, 0, 0.1]), np.array([0, 0, 1.0])).tolist())
-        for i, r in enumerate(rotations(2, 9, 5.0))
-    ]
     placed = {**model([0, 1, 2, 3]), "attempt": LOOSE, "world_from_camera": np.tile(np.eye(4), (4, 1, 1)).tolist(), "points": [[0, 0, 7.0]]}
     assert "turned on the spot" in str(failure(facts(10, turning, placed)))
-    assert "one plane" in str(failure(facts(10, wall, placed)))
-    assert failure(facts(10, wall, {**placed, "pictures": list(range(5))})) is None
+    assert "one plane" in str(failure(facts(10, WALL, placed)))
+    assert failure(facts(10, WALL, {**placed, "pictures": list(range(5))})) is None
     half = [*turning[:5], *(pair(i, i + 1) for i in range(5, 9))]
     assert "for the most part" in str(failure(facts(10, half, {**placed, "pictures": list(range(10))})))
     assert failure(facts(10, half, model(list(range(10))))) is None
-    assert failure(facts(10, wall, {**placed, "attempt": "incremental"})) is None
+    assert failure(facts(10, WALL, {**placed, "attempt": "incremental"})) is None
     assert failure(facts(10, [pair(i, i + 1) for i in range(9)], placed)) is None
 
 
 def test_each_failure_has_its_own_sentence():
     chain = [pair(i, i + 1) for i in range(9)]
-    wall = [
-        pair(i, i + 1, homography=homography(r, 600, np.array([0.4, 0, 0.1]), np.array([0, 0, 1.0])).tolist())
-        for i, r in enumerate(rotations(2, 9, 5.0))
-    ]
     sentences = {
         "share enough features": failure(facts(10, [], None)),
         "hardly moved": failure(facts(10, [pair(i, i + 1, moved=0.5) for i in range(9)], None)),
         "too little parallax: rays": failure(facts(10, chain, model(list(range(10)), angle=0.4))),
-        "one plane": failure(facts(10, wall, None)),
+        "one plane": failure(facts(10, WALL, None)),
         "overlap too little": failure(facts(10, [pair(0, 1), pair(4, 5)], None)),
         "no consistent geometry": failure(facts(10, chain, None)),
     }
@@ -156,7 +154,7 @@ def test_hopeless_pictures_are_refused_before_matching():
     assert "identical" in (hopeless([{**picture(0), "name": str(n)} for n in range(10)]) or "")
     assert "one flat colour" in (hopeless([picture(n, keypoints=0, grey=0) for n in range(5)]) or "")
     assert "without texture" in (hopeless([picture(n, keypoints=5) for n in range(5)]) or "")
-    assert "1 picture" in (hopeless([picture(0)]) or "")
+    assert "1 picture" in (hopeless([picture(0)]) or "") and hopeless([]) is not None
     assert hopeless([picture(n) for n in range(5)]) is None
     # The same scene at another size is no identical picture, and one rich pair is worth a try.
     assert hopeless([picture(0), {**picture(0), "width": 320}]) is None
@@ -164,7 +162,7 @@ def test_hopeless_pictures_are_refused_before_matching():
 
 
 def test_components_and_runs():
-    groups = components(8, [pair(0, 1), pair(1, 2), pair(5, 6), pair(2, 3, inliers=3)])
+    groups = components(8, [pair(0, 1), pair(1, 2), pair(5, 6)])
     assert groups == [[0, 1, 2], [5, 6], [3], [4], [7]]
     assert runs(["a", "b", "c", "f", "x", "y"], [0, 1, 2, 5, 8, 9]) == ["a to c", "f", "x", "y"]
 
@@ -184,11 +182,6 @@ def test_missing_frames_are_grouped_by_cause():
         record["keypoints"] = 300
     assert "little texture (300 keypoints each, the others 900)" in shortfalls(bare)[1]
     assert shortfalls(facts(3, [], model([0, 1, 2]))) == []
-
-
-@pytest.mark.parametrize("count", [0, 1])
-def test_nothing_to_work_with(count):
-    assert hopeless([picture(n) for n in range(count)]) is not None
 
 
 def test_what_stands_against_what_moves_is_told_by_its_extent():

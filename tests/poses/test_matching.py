@@ -6,26 +6,21 @@ import os
 import shutil
 from contextlib import nullcontext
 from dataclasses import replace
+from itertools import combinations
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-import pycolmap
 import pytest
 
 from fieldfuse.config import PosesSettings
 from fieldfuse.poses import database as store
 from fieldfuse.poses import match
-from fieldfuse.poses.job import Job, plan
-from fieldfuse.poses.pairs import exhaustive_pairs
-from tests.poses.textured import orbit, post, render, write_capture
+from fieldfuse.poses.job import Job
+from tests.poses.textured import all_pairs, made_job, orbit, post, render, silent, write_capture
 
 COUNT = 12
-PAIRS = exhaustive_pairs(COUNT)  # two steps, and a part of one
-
-
-def silent(done: float, total: float, note: str) -> None:
-    pass
+PAIRS = all_pairs(COUNT)  # two steps, and a part of one
 
 
 @pytest.fixture(scope="module")
@@ -33,14 +28,8 @@ def featured(tmp_path_factory) -> Job:
     """Pictures of a post, their features in the database and nothing matched."""
     folder = tmp_path_factory.mktemp("post")
     planes = post((3, 4, 13, 14))
-    pictures = [render(pose, planes=planes)[0] for pose in orbit(COUNT, 0.35)]
-    capture = write_capture(folder / "photos", pictures, ordered=True)
-    job = plan(capture, folder / "sparse", PosesSettings(max_features=500), seed=3, threads=1)
-    Path(job.folder).mkdir()
-    database = store.open_database(job)
-    store.extract(job, database, silent)
-    database.close()
-    return job
+    capture = write_capture(folder / "photos", [render(pose, planes=planes)[0] for pose in orbit(COUNT, 0.35)], ordered=True)
+    return made_job(capture, [], PosesSettings(max_features=500))
 
 
 def copy_of(job: Job, folder: Path, threads: int) -> Job:
@@ -52,19 +41,14 @@ def copy_of(job: Job, folder: Path, threads: int) -> Job:
 
 def found(job: Job) -> dict[tuple[int, int], tuple[Any, ...]]:
     """All that matching left, by pair of image ids."""
-    database = pycolmap.Database.open(job.database)
-    try:
-        ids = sorted(image.image_id for image in database.read_all_images())
-        out = {}
-        for at, first in enumerate(ids):
-            for second in ids[at + 1 :]:
-                if database.exists_matches(first, second):
-                    told = database.read_two_view_geometry(first, second)
-                    flat = [np.zeros(0) if one is None else np.asarray(one) for one in (told.F, told.E, told.H, told.inlier_matches)]
-                    out[first, second] = (np.asarray(database.read_matches(first, second)), told.config, *flat)
-        return out
-    finally:
-        database.close()
+    out = {}
+    with store.opened(job.database) as database:
+        for first, second in combinations(sorted(image.image_id for image in database.read_all_images()), 2):
+            if database.exists_matches(first, second):
+                pair = database.read_two_view_geometry(first, second)
+                flat = [np.zeros(0) if one is None else np.asarray(one) for one in (pair.F, pair.E, pair.H, pair.inlier_matches)]
+                out[first, second] = (np.asarray(database.read_matches(first, second)), pair.config, *flat)
+    return out
 
 
 @pytest.fixture(scope="module")

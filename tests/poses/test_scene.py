@@ -13,24 +13,25 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from fieldfuse.camera import (
-    OPENCV,
     Intrinsics,
     Similarity,
-    distort,
     project,
     world_from_opengl,
 )
 from fieldfuse.capture.types import Capture, Frame
 from fieldfuse.errors import InputError, PoseError
 from fieldfuse.poses.cloud import cloud_of_depth, cloud_of_points
-from fieldfuse.poses.gravity import camera_frame, tight_turn, turn_about_z, up_direction
-from fieldfuse.poses.points import intersect, tracks, triangulate, undistorted
+from fieldfuse.poses.points import intersect, tracks, triangulate
 from fieldfuse.poses.region import (
     FORWARD,
     OBJECT,
     ROOM,
     box,
+    camera_frame,
     layout,
+    tight_turn,
+    turn_about_z,
+    up_direction,
     weighted_percentiles,
 )
 from fieldfuse.poses.scene import Scene, describe_scene
@@ -130,15 +131,6 @@ def test_tracks_join_through_frames_and_drop_contradictions():
     assert len(tracks(np.zeros((0, 2), np.int64), owner)[0]) == 0
 
 
-@settings(max_examples=40, deadline=None)
-@given(st.floats(-0.2, 0.2), st.floats(-0.05, 0.05), st.floats(-0.01, 0.01))
-def test_undistorted_undoes_the_lens(k1, k2, p1):
-    camera = Intrinsics(320, 240, 300.0, 310.0, 158.0, 121.0, OPENCV, (k1, k2, p1, 0.002))
-    ideal = np.random.default_rng(0).uniform(-0.4, 0.4, (50, 2))
-    pixels = distort(camera, ideal) * [camera.fx, camera.fy] + [camera.cx, camera.cy]
-    np.testing.assert_allclose(undistorted(camera, pixels), ideal, atol=1e-6)
-
-
 def test_fox_points_reproject_within_two_pixels():
     from fieldfuse.capture import open_capture
 
@@ -177,20 +169,6 @@ def test_surfaces_may_stand_out_of_the_region_but_in_rooms(layout, grown, scene)
     low, high = replace(scene, layout=layout).surface_box()
     np.testing.assert_allclose((low + high) / 2, scene.centre, atol=1e-12)
     np.testing.assert_allclose((high - low) / 2, grown * scene.half_size)
-
-
-@settings(max_examples=30, deadline=None)
-@given(st.integers(0, 10_000), st.floats(-3, 3), st.floats(0, 7e6))
-def test_undoing_the_working_frame_is_the_identity(seed, log_scale, far):
-    random = np.random.default_rng(seed)
-    rotation = cv2.Rodrigues(random.standard_normal(3))[0]
-    whole = Similarity(10.0**log_scale, rotation, far * random.standard_normal(3) / 3)
-    there = Similarity(float(random.uniform(0.1, 10)), cv2.Rodrigues(random.standard_normal(3))[0], np.zeros(3)).after(
-        Similarity(1.0, np.eye(3), -whole.translation)
-    )
-    points = whole.points(random.uniform(-1, 1, (50, 3)))
-    back = there.inverse().points(there.points(points))
-    assert np.abs(back - points).max() <= 1e-9 * max(1.0, 10.0**log_scale) + 4e-16 * 10 * np.abs(points).max()
 
 
 def test_the_scene_does_not_depend_on_where_and_how_large_the_input_is(corner, scene):

@@ -15,6 +15,7 @@ import psutil
 import pytest
 from PIL import Image
 
+from fieldfuse.capture.types import Capture, Frame
 from fieldfuse.config import PosesSettings
 from fieldfuse.errors import InputError, Interrupted, PoseError
 from fieldfuse.files import read_json
@@ -97,10 +98,10 @@ def test_points_reproject_and_opencv_axes_hold(found):
 
 
 def test_what_would_not_repeat_takes_one_thread_unless_pictures_are_many():
-    from fieldfuse.poses.job import REPEATABLE, Job, Picture
+    from fieldfuse.poses.job import REPEATABLE, Job
 
     for count, expected in ((2, 1), (REPEATABLE, 1), (REPEATABLE + 1, 4)):
-        assert Job("out", (Picture("a", "a.png"),) * count, True, True, False, 1600, 4096, 0, 4).repeating == expected
+        assert Job("out", (Frame("a", Path("a.png")),) * count, True, True, False, 1600, 4096, 0, 4).repeating == expected
 
 
 def test_a_second_run_reuses_features_and_gives_the_same(found, pictures, tmp_path):
@@ -110,8 +111,6 @@ def test_a_second_run_reuses_features_and_gives_the_same(found, pictures, tmp_pa
     capture = write_capture(tmp_path / "fresh", pictures[0])
     fresh = find_poses(capture, tmp_path, SMALL, seed=3, threads=2)
     np.testing.assert_array_equal(fresh.world_from_camera, result.world_from_camera)  # one thread and two
-    from fieldfuse.capture.types import Capture, Frame
-
     frames = tuple(Frame(path.stem, path) for path in sorted((out / "photos").iterdir()))
     again = find_poses(Capture("photos", out / "photos", frames), out, SMALL, seed=3, threads=1, progress=listener)
     np.testing.assert_allclose(again.world_from_camera, result.world_from_camera, atol=1e-6)
@@ -159,8 +158,6 @@ def test_a_partial_model_names_what_is_missing_and_why(pictures, tmp_path):
 def test_pictures_turned_by_exif_are_seen_upright(pictures, tmp_path):
     capture = write_capture(tmp_path / "photos", [])
     frames = []
-    from fieldfuse.capture.types import Capture, Frame
-
     for n, picture in enumerate(pictures[0][:5]):
         image = Image.fromarray(np.ascontiguousarray(np.rot90(picture)))  # stored turned; orientation 6 turns it back
         exif = image.getexif()

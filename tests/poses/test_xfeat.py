@@ -18,21 +18,14 @@ import torch.nn.functional as F
 from fieldfuse.capture import open_capture
 from fieldfuse.config import PosesSettings
 from fieldfuse.errors import InputError, PoseError
-from fieldfuse.poses import database as store
-from fieldfuse.poses import placing, sfm, xfeat
-from fieldfuse.poses.features import floats, learned, sift
-from fieldfuse.poses.job import GONE_ON, SIFT, XFEAT, Job, plan
-from fieldfuse.poses.mapping import Model, plain
-from fieldfuse.poses.match import match
-from fieldfuse.poses.pairs import exhaustive_pairs
+from fieldfuse.poses import sfm, worker, xfeat
+from fieldfuse.poses.database import floats, learned, sift
+from fieldfuse.poses.job import GONE_ON, SIFT, XFEAT, Job
+from fieldfuse.poses.mapping import many, plain
 from tests.conftest import shared_data
-from tests.poses.textured import aligned_error, arc, render, turning, write_capture
+from tests.poses.textured import aligned_error, all_pairs, arc, centre_error, made_job, render, silent, turning, write_capture
 
 needs_weights = pytest.mark.skipif(xfeat.weights_file() is None, reason=f"XFeat's weights are not installed: {xfeat.INSTALL}")
-
-
-def silent(done: float, total: float, note: str) -> None:
-    pass
 
 
 def made_up() -> dict[str, torch.Tensor]:
@@ -211,43 +204,38 @@ def test_doctor_says_what_to_install(tmp_path, weights):
 # ------------------------------------------------------------------------------------------------- which model is taken
 
 
-def placed(attempt: str, *shares: float) -> placing.Placed:
+def placed(attempt: str, *shares: float) -> worker.Placed:
     model = SimpleNamespace(attempt=attempt) if shares else None
     return model, {"agreement": dict(enumerate(shares))}  # type: ignore[return-value]
 
 
 def test_more_images_are_taken_where_their_matches_agree():
-    strict, loose = "incremental", placing.LOOSE
+    strict, loose = "incremental", worker.LOOSE
     before = placed(strict, 0.9, 0.9, 0.9)
-    assert placing._better(placed(strict, 0.9, 0.9, 0.9, 0.9), before)
-    assert placing._better(placed(strict, 0.9, 0.9, 0.9), placed(strict))
-    assert placing._better(placed(strict, 0.9, 0.9, 0.9), placed(strict, 0.9, 0.9, 0.75))  # as many, and clearer
-    assert not placing._better(placed(strict, 0.9, 0.9, 0.9, 0.4), before)  # the one more contradicts its matches
+    assert worker._better(placed(strict, 0.9, 0.9, 0.9, 0.9), before)
+    assert worker._better(placed(strict, 0.9, 0.9, 0.9), placed(strict))
+    assert worker._better(placed(strict, 0.9, 0.9, 0.9), placed(strict, 0.9, 0.9, 0.75))  # as many, and clearer
+    assert not worker._better(placed(strict, 0.9, 0.9, 0.9, 0.4), before)  # the one more contradicts its matches
     for looser in (loose, GONE_ON):
-        assert not placing._better(placed(looser, 0.9, 0.9, 0.9, 0.9), before)
-        assert placing._better(placed(looser, 0.9, 0.9, 0.9), placed(strict))
-        assert not placing._better(placed(looser, 0.9, 0.4, 0.9), placed(strict))
-    assert not placing._better(placed(strict, 0.9, 0.9), before)
-    assert not placing._better(placed(strict, 0.8, 0.9, 0.9), before)
+        assert not worker._better(placed(looser, 0.9, 0.9, 0.9, 0.9), before)
+        assert worker._better(placed(looser, 0.9, 0.9, 0.9), placed(strict))
+        assert not worker._better(placed(looser, 0.9, 0.4, 0.9), placed(strict))
+    assert not worker._better(placed(strict, 0.9, 0.9), before)
+    assert not worker._better(placed(strict, 0.8, 0.9, 0.9), before)
 
 
 def test_a_model_that_is_folded_or_without_depth_is_not_taken(tmp_path, monkeypatch):
-    monkeypatch.setattr(placing, "plain", lambda model: model)
-    monkeypatch.setattr(placing, "failure", lambda facts: facts["model"])
+    monkeypatch.setattr(worker.mapping, "plain", lambda model: model)
+    monkeypatch.setattr(worker, "failure", lambda facts: facts["model"])
     job = Job(str(tmp_path), (), True, True, False, 1600, 100, 0, 1)
     whole, mended, folded = ({"folded": one} for one in (None, {"left": 0, "contradicting": 5}, {"left": 5, "contradicting": 5}))
-    assert placing._sane(job, None, whole) and placing._sane(job, None, mended) and not placing._sane(job, None, folded)  # type: ignore[arg-type]
-    assert placing._sane(replace(job, sequential=False), None, folded)  # type: ignore[arg-type]
-    assert not placing._sane(job, "too little parallax", whole)  # type: ignore[arg-type]
+    assert worker._sane(job, None, whole) and worker._sane(job, None, mended) and not worker._sane(job, None, folded)  # type: ignore[arg-type]
+    assert worker._sane(replace(job, sequential=False), None, folded)  # type: ignore[arg-type]
+    assert not worker._sane(job, "too little parallax", whole)  # type: ignore[arg-type]
 
 
-def test_a_few_frames_of_many_are_not_worth_another_attempt(tmp_path):
-    def job(count: int) -> Job:
-        return SimpleNamespace(pictures=(None,) * count)  # type: ignore[return-value]
-
-    assert placing._too_many(job(8), [3]) and not placing._too_many(job(8), [])
-    assert not placing._too_many(job(100), [1, 2]) and placing._too_many(job(100), [1, 2, 3])
-    assert not placing._too_many(job(300), [1, 2, 3, 4, 5]) and placing._too_many(job(300), list(range(6)))
+def test_a_few_frames_of_many_are_not_worth_another_attempt():
+    assert 2 < many(100) <= 3 and 5 < many(300) <= 6
 
 
 # ------------------------------------------------------------------------------------------------- with the real weights
@@ -276,18 +264,7 @@ def ready(folder: Path, poses: np.ndarray, contrast: float, **how: Any) -> Job:
     """A job of photos of so little contrast, with its features and matches."""
     photos = [np.round(120 + contrast * (render(pose)[0].astype(np.float64) - 120)).astype(np.uint8) for pose in poses]
     capture = write_capture(folder / "photos", photos)
-    job = plan(capture, folder / "sparse", PosesSettings(), seed=3, threads=1, **how)
-    Path(job.folder).mkdir()
-    database = store.open_database(job)
-    job = store.tolerant(job, store.extract(job, database, silent))
-    database.close()
-    match(job, exhaustive_pairs(len(poses)), silent)
-    return job
-
-
-def error(model: Model, poses: np.ndarray) -> float:
-    found = plain(model)
-    return aligned_error(np.array(found["world_from_camera"])[:, :3, 3], poses[found["pictures"], :3, 3])
+    return made_job(capture, all_pairs(len(poses)), **how)
 
 
 @needs_weights
@@ -295,16 +272,16 @@ def error(model: Model, poses: np.ndarray) -> float:
 def test_photos_of_little_contrast_are_tried_by_other_features(tmp_path, monkeypatch, contrast):
     poses = arc(5, 60)
     job = ready(tmp_path, poses, contrast, second=XFEAT)
-    before, _ = placing._mapped(job, silent)
+    before, _ = worker._mapped(job, silent)
     assert before is None or len(before.registered) < 5  # the reason to look again
     notes: list[str] = []
-    model, facts = placing.place(job, lambda done, total, note: notes.append(note))
-    assert model is not None and len(model.registered) == 5 and error(model, poses) < 0.02
+    model, facts = worker.place(job, lambda done, total, note: notes.append(note))
+    assert model is not None and len(model.registered) == 5 and centre_error(model, poses) < 0.02
     assert min(facts["agreement"].values()) > 0.8 and any("by other features" in note for note in notes)
     assert min(record["keypoints"] for record in facts["pictures"]) > 100  # the records are those of the model's features
-    assert plain(placing.place(job, silent)[0]) == plain(model)  # from what is there
-    monkeypatch.setattr(placing, "_otherwise", lambda *_: pytest.fail("was tried by other features"))
-    placing.place(replace(job, second=None), silent)
+    assert plain(worker.place(job, silent)[0]) == plain(model)  # from what is there
+    monkeypatch.setattr(worker, "_otherwise", lambda *_: pytest.fail("was tried by other features"))
+    worker.place(replace(job, second=None), silent)
 
 
 @needs_weights

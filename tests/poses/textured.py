@@ -3,7 +3,9 @@ turns."""
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from functools import cache
+from itertools import combinations
 from pathlib import Path
 from typing import Any
 
@@ -12,6 +14,11 @@ import numpy as np
 
 from fieldfuse.camera import Array, Intrinsics, invert
 from fieldfuse.capture.types import Capture, Frame
+from fieldfuse.config import PosesSettings
+from fieldfuse.poses import database as store
+from fieldfuse.poses.job import Job, plan
+from fieldfuse.poses.mapping import Model, plain
+from fieldfuse.poses.match import match
 
 CAMERA = Intrinsics(320, 240, 300.0, 300.0, 160.0, 120.0)
 # Point, two edges: floor, two walls that meet, and a box's face and top before them.
@@ -145,6 +152,31 @@ def write_capture(folder: Path, pictures: list[Array], ordered: bool = False) ->
         cv2.imwrite(str(path), picture if picture.ndim == 2 else picture[..., ::-1])
         frames.append(Frame(path.stem, path))
     return Capture("photos", folder, tuple(frames), ordered=ordered)
+
+
+def silent(done: float, total: float, note: str) -> None:
+    """A report that goes nowhere."""
+
+
+def all_pairs(count: int) -> list[tuple[int, int]]:
+    return list(combinations(range(count), 2))
+
+
+def made_job(capture: Capture, pairs: Iterable[tuple[int, int]], settings: PosesSettings | None = None, **how: Any) -> Job:
+    """A job beside the capture's images, with its features in the database and these pairs matched."""
+    job = plan(capture, capture.root.parent / "sparse", settings or PosesSettings(), seed=3, threads=1, **how)
+    Path(job.folder).mkdir()
+    database = store.open_database(job)
+    job = store.tolerant(job, store.extract(job, database, silent))
+    database.close()
+    match(job, list(pairs), silent)
+    return job
+
+
+def centre_error(model: Model, poses: Array) -> float:
+    """`aligned_error` of the cameras of a model of some of these poses."""
+    found = plain(model)
+    return aligned_error(np.array(found["world_from_camera"])[:, :3, 3], poses[found["pictures"], :3, 3])
 
 
 def aligned_error(found: Array, true: Array) -> float:

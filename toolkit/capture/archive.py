@@ -1,4 +1,4 @@
-"""Captures that come as one zip file and are read without unpacking: `walk.r3d/rgbd/0.jpg` is the member `rgbd/0.jpg` of `walk.r3d`.
+"""Files of captures, some of them read inside a zip file: `walk.r3d/rgbd/0.jpg` is the member `rgbd/0.jpg` of `walk.r3d`.
 
 Members are looked up and never written by their names, so what a zip says its members are called cannot lead anywhere.
 """
@@ -12,7 +12,7 @@ from pathlib import Path
 from fieldfuse.errors import InputError, first_line
 
 SUFFIXES = (".r3d", ".zip")
-MOST_BYTES = 64 * 2**20  # of one member: a picture of a phone has five
+MOST_BYTES = 64 * 2**20  # of one member: an image of a phone has five
 
 
 def archive_of(path: Path) -> Path | None:
@@ -21,27 +21,35 @@ def archive_of(path: Path) -> Path | None:
 
 
 def members(archive: Path) -> list[str]:
-    """Names of everything in a zip file, as it says.
-
-    Raises:
-        InputError: no such file, no zip file, or one that is cut short.
-    """
+    """Names of everything in a zip file."""
     return _opened(archive).namelist()
 
 
-def read_member(path: Path, most: int = MOST_BYTES) -> bytes:
-    """All bytes of a member; `path` is that of the archive with the member's name behind it.
+def read_bytes(path: Path) -> bytes:
+    """The whole file, which may be a zip file's member.
 
     Raises:
-        InputError: no such member, damaged, encrypted, or larger than `most` bytes when it is inflated.
+        InputError: missing, unreadable or empty.
     """
+    try:
+        data = Path(path).read_bytes()
+    except NotADirectoryError:
+        data = read_member(Path(path))
+    except OSError as error:
+        raise InputError(f"cannot read the image {path}: {error.strerror or error}") from error
+    if not data:
+        raise InputError(f"the image {path} is empty (0 bytes); copy it again or remove it")
+    return data
+
+
+def read_member(path: Path, most: int = MOST_BYTES) -> bytes:
+    """All bytes of a member; `path` is that of the archive with the member's name behind it."""
     archive = archive_of(path)
     if archive is None:
         raise InputError(f"cannot read {path}: it does not lie in a zip file; check the name")
     opened, name = _opened(archive), path.relative_to(archive).as_posix()
     try:
-        # What a member says its size is bounds what is inflated of it.
-        size = opened.getinfo(name).file_size
+        size = opened.getinfo(name).file_size  # bounds what is inflated
         if size > most:
             raise InputError(f"{path} has {size / 2**20:.0f} MB when it is unpacked, more than the {most / 2**20:.0f} MB that are read")
         return opened.read(name)
@@ -56,7 +64,7 @@ def read_member(path: Path, most: int = MOST_BYTES) -> bytes:
 def _opened(archive: Path) -> zipfile.ZipFile:
     try:
         stat = archive.stat()
-        return _kept(archive, stat.st_size, stat.st_mtime_ns)
+        return _cached(archive, stat.st_size, stat.st_mtime_ns)
     except OSError as error:
         raise InputError(f"cannot read {archive}: {error.strerror or error}") from error
     except Exception as error:  # the directory of a damaged zip raises many families
@@ -64,6 +72,6 @@ def _opened(archive: Path) -> zipfile.ZipFile:
 
 
 @lru_cache(maxsize=2)
-def _kept(archive: Path, size: int, modified: int) -> zipfile.ZipFile:
+def _cached(archive: Path, size: int, modified: int) -> zipfile.ZipFile:
     """An open zip file: reading its directory takes tens of milliseconds where it has thousands of members."""
     return zipfile.ZipFile(archive)

@@ -1,32 +1,30 @@
 """A COLMAP model with its images. Both may lie anywhere below the folder: `sparse/0` and `images/`, `dense/0/sparse` and `dense/0/images`,
 the model in one folder and the images in its sibling.
 
-A folder may hold several models, of the photos as they were taken and of undistorted ones, or parts that were not joined. Taken is the one
+A folder may hold several models, of the photos as they were taken and of undistorted ones, or parts that were not joined. Used is the one
 that most images fit by name and by size.
 """
 
 from __future__ import annotations
 
 import re
-from collections.abc import Iterator
 from contextlib import suppress
 from dataclasses import dataclass, replace
 from pathlib import Path
 
-import numpy as np
-
-from fieldfuse.camera import Intrinsics
+from fieldfuse.capture.calibration import fits_shape, fitted
 from fieldfuse.capture.colmap_model import Model, holds_model, read_model
-from fieldfuse.capture.listing import assemble, counted, natural_key, pictures_in, require_folder, unique_names
+from fieldfuse.capture.headers import image_header
+from fieldfuse.capture.images import spread
+from fieldfuse.capture.listing import assemble, counted, images_in, natural_key, require_folder, some_of, unique_names
 from fieldfuse.capture.masks import masks_among
 from fieldfuse.capture.resolve import CaptureFiles, Found
-from fieldfuse.capture.sizes import fits_shape, fitted, picture_header
 from fieldfuse.capture.types import Capture, Frame
 from fieldfuse.errors import InputError
 
 USUAL = re.compile(r"((colmap|dense|distorted|undistorted)/(\d+/)?)*sparse(/\d+)?|\.")
 MOST_MODELS = 20
-LEAST_IMAGES = 6  # of a model that is held against another
+LEAST_IMAGES = 6  # of a model that is compared with another
 SAMPLED = 24  # images of a model whose sizes are compared with its cameras
 
 
@@ -68,44 +66,32 @@ def owners(root: Path) -> list[Path]:
 
 def has_images(root: Path) -> bool:
     """Whether images lie where those of a model mostly do."""
-    return any(pictures_in(folder) for folder in (root / "images", root))
+    return any(images_in(folder) for folder in (root / "images", root))
 
 
 def candidate_models(root: Path) -> list[CandidateModel]:
-    """The models that can be read, best first: the one that most images fit, by name and size.
-
-    Raises:
-        InputError: none is there, none can be read, or images of the same names lie in two places.
-    """
+    """The models that can be read, best first: the one that most images fit, by name and size."""
     folders = model_folders(root)
     if not folders:
         raise InputError(f"{root} holds no COLMAP model (cameras and images as .bin or .txt in sparse/0); export one there")
-    top = _above_model(root)
-    files = CaptureFiles(top)
-    candidates, errors = [], []
+    files = CaptureFiles(_above_model(root))
+    candidates, errors, unused = [], [], []
     for folder in folders:
         try:
             candidates.append(_candidate(root, folder, files))
         except InputError as error:
-            errors.append((folder, error))
-    if not candidates:
-        raise errors[0][1]
-    remarks = tuple(f"the model in {_name(root, folder)} is not used: {error}" for folder, error in errors)
+            errors.append(error)
+            unused.append(f"the model in {folder.relative_to(root).as_posix()} is not used: {error}")
     ranked = sorted(candidates, key=lambda one: (-one.fit, -one.exact, -len(one.images)))
-    if not ranked[0].images and errors:
-        raise errors[0][1]
-    return [_among(one, ranked, remarks) for one in ranked]
-
-
-def candidate_captures(path: Path | str) -> Iterator[Capture]:
-    """The captures that the models in a folder make, best first; each is made when it is asked for.
-
-    Raises:
-        InputError: no model, a broken model, none of its images on disk, or an image of another shape than its camera.
-    """
-    root = require_folder(path)
-    for candidate in candidate_models(root):
-        yield _capture(root, candidate)
+    if errors and (not ranked or not ranked[0].images):
+        raise errors[0]
+    out = []
+    for one in ranked:
+        others = [other for other in ranked if other is not one]
+        rest = [f"{other.name} ({counted(len(other.model.images), 'image')}, {other.fit} of which fit)" for other in others]
+        remark = f"of several models that in {one.name} is used, which {one.fit} images fit; not used: {some_of(rest)}"
+        out.append(replace(one, remarks=(*unused, *([remark] if rest else []), *one.remarks)))
+    return out
 
 
 def model_captures(capture: Capture) -> list[Capture]:
@@ -116,7 +102,7 @@ def model_captures(capture: Capture) -> list[Capture]:
     for candidate in candidate_models(capture.root)[1:MOST_MODELS]:
         with suppress(InputError):
             if len(candidate.images) >= max(LEAST_IMAGES, len(capture.frames) // 2):
-                out.append(_capture(capture.root, candidate))
+                out.append(candidate_capture(capture.root, candidate))
     return out
 
 
@@ -124,12 +110,14 @@ def read_colmap(path: Path | str) -> Capture:
     """The registered images that exist, with cameras, poses and sparse points in the model's frame.
 
     Raises:
-        InputError: as `candidate_captures`.
+        InputError: no model, a broken model, none of its images on disk, or an image of another shape than its camera.
     """
-    return next(candidate_captures(path))
+    root = require_folder(path)
+    return candidate_capture(root, candidate_models(root)[0])
 
 
-def _capture(root: Path, candidate: CandidateModel) -> Capture:
+def candidate_capture(root: Path, candidate: CandidateModel) -> Capture:
+    """The capture that one of the models makes."""
     model, images = candidate.model, candidate.images
     listed = len(model.images)
     if not images:
@@ -139,21 +127,21 @@ def _capture(root: Path, candidate: CandidateModel) -> Capture:
     for index, name in zip(located, unique_names([images[index] for index in located]), strict=True):
         entry = model.images[index]
         described = model.cameras[entry.camera]
-        intrinsics = fitted(described, picture_header(images[index]).size, f"{entry.name} in {root / candidate.name}", images[index])
+        intrinsics = fitted(described, image_header(images[index]).size, f"{entry.name} in {root / candidate.name}", images[index])
         scaled += intrinsics is not described
         frames.append(Frame(name=name, image=images[index], intrinsics=intrinsics, world_from_camera=entry.world_from_camera))
     missing = listed - len(frames)
     if missing:
         warnings.append(f"{missing} of the {listed} images of the model do not exist; the other {len(frames)} are used")
     if scaled:
-        warnings.append(f"{counted(scaled, 'picture')} of another size than the model tells; intrinsics were scaled to fit")
+        warnings.append(f"{counted(scaled, 'image')} of another size than in the model; intrinsics were scaled to fit")
     used = set(images.values())
     unregistered = 0
     for folder in {image.parent for image in used}:
-        pictures = pictures_in(folder)
-        unregistered += len(set(pictures) - used - masks_among(pictures))
+        beside = images_in(folder)
+        unregistered += len(set(beside) - used - masks_among(beside))
     if unregistered:
-        warnings.append(f"{counted(unregistered, 'picture')} beside these are not in the model and are left out")
+        warnings.append(f"{counted(unregistered, 'image')} beside these are not in the model and are left out")
     extra = {"listed": listed, "missing": missing, "unregistered": unregistered}
     return assemble("colmap", root, frames, warnings, points=model.points if len(model.points) else None, extra=extra)
 
@@ -162,23 +150,23 @@ def _candidate(root: Path, folder: Path, files: CaptureFiles) -> CandidateModel:
     """The model in `folder` with the images that fit it best: of the folders around it, nearest first, else of any other."""
     model = read_model(folder)
     names = [image.name for image in model.images]
-    name = _name(root, folder)
+    name = folder.relative_to(root).as_posix()
     found: Found | None = None
     best = (0, 0.0)
-    for base in _bases(folder.resolve(), files):
-        here = files.find(names, source=name, base=base, anywhere=False)
-        fit = _fit(model, here)
-        if here.count and (found is None or fit > best):
-            found, best = here, fit
-        if best[1] == 1 and found is not None and found.count == len(names):
+    for above in (folder.resolve(), *folder.resolve().parents):
+        for base in (place.relative_to(files.root).as_posix() for place in (above / "images", above) if place.is_dir()):
+            here = files.find(names, source=name, base=base, anywhere=False)
+            fit = _fit(model, here)
+            if here.count and (found is None or fit > best):
+                found, best = here, fit
+        if above == files.root or (found is not None and best[1] == 1 and found.count == len(names)):
             break
     remarks: list[str] = []
     if found is None:
         found = files.find(names, source=name, base="images", anywhere=files.root == root.resolve())
         best = _fit(model, found)
         places = sorted({path.parent.relative_to(files.root).as_posix() for path in found.files if path is not None})
-        if places:
-            remarks.append(f"the images of the model in {name} were found in {', '.join(places[:3])}{', …' if len(places) > 3 else ''}")
+        remarks += [f"the images of the model in {name} were found in {some_of(places)}"] if places else []
     else:
         remarks += found.remarks
     if not USUAL.fullmatch(name):
@@ -187,33 +175,18 @@ def _candidate(root: Path, folder: Path, files: CaptureFiles) -> CandidateModel:
     return CandidateModel(name, model, there, *best, found.outside, tuple(remarks))
 
 
-def _bases(folder: Path, files: CaptureFiles) -> list[str]:
-    """Where the images of the model in `folder` may lie: in `images/` beside it, then beside it, then further up to the top."""
-    out = []
-    for above in (folder, *folder.parents):
-        out += [place.relative_to(files.root).as_posix() for place in (above / "images", above) if place.is_dir()]
-        if above == files.root:
-            return out
-    return out
-
-
 def _fit(model: Model, found: Found) -> tuple[int, float]:
     """How many images have their camera's shape, and the share of those looked at that have its very size."""
-    there = [index for index, path in enumerate(found.files) if path is not None]
-    if not there:
-        return 0, 0.0
-    chosen = [there[int(place)] for place in np.unique(np.linspace(0, len(there) - 1, SAMPLED).round())]
-    shapes = [_shape(model.cameras[model.images[index].camera], found.files[index]) for index in chosen]
-    return round(len(there) * sum(shape > 0 for shape in shapes) / len(shapes)), sum(shape == 2 for shape in shapes) / len(shapes)
-
-
-def _shape(camera: Intrinsics, path: Path | None) -> int:
-    """2: an image of the camera's size, 1: of its shape, 0: of neither, or no image."""
-    try:
-        size = picture_header(path).size if path is not None else (0, 0)
-    except InputError:
-        return 0
-    return 2 if size == (camera.width, camera.height) else int(fits_shape(camera, size))
+    there = [(image, path) for image, path in zip(model.images, found.files, strict=True) if path is not None]
+    chosen = spread(there, SAMPLED)
+    shapes = exact = 0
+    for image, path in chosen:
+        camera = model.cameras[image.camera]
+        with suppress(InputError):
+            size = image_header(path).size
+            exact += size == (camera.width, camera.height)
+            shapes += fits_shape(camera, size)
+    return round(len(there) * shapes / max(len(chosen), 1)), exact / max(len(chosen), 1)
 
 
 def _above_model(root: Path) -> Path:
@@ -224,17 +197,3 @@ def _above_model(root: Path) -> Path:
     for name in ("sparse", "colmap"):
         top = top.parent if top.name == name else top
     return top
-
-
-def _name(root: Path, folder: Path) -> str:
-    return folder.relative_to(root).as_posix()
-
-
-def _among(one: CandidateModel, ranked: list[CandidateModel], remarks: tuple[str, ...]) -> CandidateModel:
-    """The candidate with a remark on those that it was chosen from."""
-    rest = [other for other in ranked if other is not one]
-    others = [f"{other.name} ({counted(len(other.model.images), 'image')}, {other.fit} of which fit)" for other in rest]
-    if others:
-        more = ", …" if len(others) > 3 else ""
-        remarks += (f"of several models that in {one.name} is used, which {one.fit} images fit; not used: {', '.join(others[:3])}{more}",)
-    return replace(one, remarks=remarks + one.remarks)

@@ -1,6 +1,6 @@
 """COLMAP's model files, `cameras`, `images`, `points3D`, as `.bin` or `.txt`. Plain parsing with every length checked.
 
-Only what a capture needs is kept: cameras, image names with poses, point positions. COLMAP's pixel centres are at +0.5 like ours.
+Only what a capture needs is read: cameras, image names with poses, point positions. COLMAP's pixel centres are at +0.5 like ours.
 """
 
 from __future__ import annotations
@@ -15,50 +15,35 @@ from pathlib import Path
 import numpy as np
 
 from fieldfuse.camera import FISHEYE, OPENCV, PINHOLE, Array, Intrinsics, invert
+from fieldfuse.capture.calibration import usable_size
 from fieldfuse.capture.listing import read_text
 from fieldfuse.capture.poses import checked_place, rigid
 from fieldfuse.errors import InputError, first_line
 
 MAX_TEXT = 2**30
-MAX_SIDE = 1_000_000
-BESIDE = 0.5  # of a picture's side by which a principal point may lie outside: pictures may have been cropped once their camera was known
-# number, name, parameters
-MODELS = (
-    (0, "SIMPLE_PINHOLE", 3),
-    (1, "PINHOLE", 4),
-    (2, "SIMPLE_RADIAL", 4),
-    (3, "RADIAL", 5),
-    (4, "OPENCV", 8),
-    (5, "OPENCV_FISHEYE", 8),
-    (6, "FULL_OPENCV", 12),
-    (7, "FOV", 5),
-    (8, "SIMPLE_RADIAL_FISHEYE", 4),
-    (9, "RADIAL_FISHEYE", 5),
-    (10, "THIN_PRISM_FISHEYE", 12),
-    (11, "RAD_TAN_THIN_PRISM_FISHEYE", 16),
-    (12, "SIMPLE_DIVISION", 4),
-    (13, "DIVISION", 5),
-    (14, "SIMPLE_FISHEYE", 3),
-    (15, "FISHEYE", 4),
-    (16, "EUCM", 6),
-    (17, "EQUIRECTANGULAR", 2),
+BESIDE = 0.5  # of an image's side by which a principal point may lie outside: images may have been cropped once their camera was known
+MODELS = (  # by COLMAP's numbers: name, parameters, and our lens, where it has one
+    ("SIMPLE_PINHOLE", 3, PINHOLE),
+    ("PINHOLE", 4, PINHOLE),
+    ("SIMPLE_RADIAL", 4, OPENCV),
+    ("RADIAL", 5, OPENCV),
+    ("OPENCV", 8, OPENCV),
+    ("OPENCV_FISHEYE", 8, FISHEYE),
+    ("FULL_OPENCV", 12, OPENCV),
+    ("FOV", 5, None),
+    ("SIMPLE_RADIAL_FISHEYE", 4, FISHEYE),
+    ("RADIAL_FISHEYE", 5, FISHEYE),
+    ("THIN_PRISM_FISHEYE", 12, None),
+    ("RAD_TAN_THIN_PRISM_FISHEYE", 16, None),
+    ("SIMPLE_DIVISION", 4, None),
+    ("DIVISION", 5, None),
+    ("SIMPLE_FISHEYE", 3, FISHEYE),
+    ("FISHEYE", 4, FISHEYE),
+    ("EUCM", 6, None),
+    ("EQUIRECTANGULAR", 2, None),
 )
-NAME_OF = {number: name for number, name, _ in MODELS}
-COUNT_OF = {name: count for _, name, count in MODELS}
+SUPPORTED = {name: (count, lens) for name, count, lens in MODELS if lens is not None}
 ONE_FOCAL = ("SIMPLE_PINHOLE", "SIMPLE_RADIAL", "RADIAL", "SIMPLE_RADIAL_FISHEYE", "RADIAL_FISHEYE", "SIMPLE_FISHEYE")
-LENS_OF = {
-    "SIMPLE_PINHOLE": PINHOLE,
-    "PINHOLE": PINHOLE,
-    "SIMPLE_RADIAL": OPENCV,
-    "RADIAL": OPENCV,
-    "OPENCV": OPENCV,
-    "FULL_OPENCV": OPENCV,
-    "OPENCV_FISHEYE": FISHEYE,
-    "SIMPLE_RADIAL_FISHEYE": FISHEYE,
-    "RADIAL_FISHEYE": FISHEYE,
-    "SIMPLE_FISHEYE": FISHEYE,
-    "FISHEYE": FISHEYE,
-}
 
 
 @dataclass(frozen=True)
@@ -84,20 +69,17 @@ def holds_model(folder: Path) -> bool:
 
 
 def read_model(folder: Path) -> Model:
-    """The model in `folder`; binary files go before text files.
-
-    Raises:
-        InputError: a file is cut short, holds counts that cannot be, an unsupported camera or an unusable pose.
-    """
-    suffix = ".bin" if all((folder / f"{part}.bin").is_file() for part in ("cameras", "images")) else ".txt"
-    cameras, images, points = (folder / f"{part}{suffix}" for part in ("cameras", "images", "points3D"))
-    empty = np.zeros((0, 3))
-    if suffix == ".bin":
-        found = points.is_file()
-        model = Model(_cameras_bin(cameras), _images_bin(images), _points_bin(points) if found else empty)
-    else:
-        found = points.is_file()
-        model = Model(_cameras_txt(cameras), _images_txt(images), _points_txt(points) if found else empty)
+    """The model in `folder`; binary files go before text files."""
+    binary = all((folder / f"{part}.bin").is_file() for part in ("cameras", "images"))
+    cameras, images, points = (folder / f"{part}.{'bin' if binary else 'txt'}" for part in ("cameras", "images", "points3D"))
+    positions = np.zeros((0, 3))
+    if points.is_file():
+        positions = np.fromiter((_points_bin if binary else _points_txt)(points), dtype=np.dtype((np.float64, 3)))
+    model = Model(
+        dict((_cameras_bin if binary else _cameras_txt)(cameras)),
+        list((_images_bin if binary else _images_txt)(images)),
+        positions[np.isfinite(positions).all(axis=1)],
+    )
     if not model.images:
         raise InputError(f"the model in {folder} has no registered images; run structure from motion again")
     for image in model.images:
@@ -107,33 +89,26 @@ def read_model(folder: Path) -> Model:
 
 
 def intrinsics_of(model: str, width: int, height: int, values: list[float], where: str) -> Intrinsics:
-    """A COLMAP camera as ours; its radial models are OpenCV's with the absent coefficients 0.
-
-    Raises:
-        InputError: the model has no counterpart here, or the values are no usable camera.
-    """
-    if model not in LENS_OF:
+    """A COLMAP camera as ours; its radial models are OpenCV's with the absent coefficients 0."""
+    if model not in SUPPORTED:
         raise InputError(f"{where}: the camera model {model} is not supported; run `colmap image_undistorter` and give its output")
-    if len(values) != COUNT_OF[model]:
-        raise InputError(
-            f"{where}: the camera model {model} has {COUNT_OF[model]} parameters, not {len(values)}; check how the file was written"
-        )
-    if not (0 < width <= MAX_SIDE and 0 < height <= MAX_SIDE):
-        raise InputError(f"{where}: the image size {width}×{height} is not usable; check how the file was written")
-    head = [values[0], *values] if model in ONE_FOCAL else values
-    fx, fy, cx, cy, *lens = head
-    if LENS_OF[model] != PINHOLE:
+    count, kind = SUPPORTED[model]
+    if len(values) != count:
+        raise InputError(f"{where}: the camera model {model} has {count} parameters, not {len(values)}; check how the file was written")
+    fx, fy, cx, cy, *lens = [values[0], *values] if model in ONE_FOCAL else values
+    if kind != PINHOLE:
         lens += [0.0] * (4 - len(lens))
-    return Intrinsics(width, height, fx, fy, cx, cy, LENS_OF[model], tuple(lens)).checked(where).centred(where, BESIDE)
+    return Intrinsics(*usable_size(width, height, where), fx, fy, cx, cy, kind, tuple(lens)).checked(where).centred(where, BESIDE)
 
 
-def _image(name: str, camera: int, quaternion: list[float], translation: list[float], where: str) -> ModelImage:
-    if not np.isfinite(translation).all():
+def _image(name: str, camera: int, values: list[float], where: str) -> ModelImage:
+    """From the quaternion and translation of camera_from_world."""
+    place = np.array(values[4:])
+    if not np.isfinite(place).all():
         raise InputError(f"{where}: the pose of {name!r} holds a value that is not finite; remove this image from the model")
     where = f"{where}, image {name!r}"
-    checked_place(np.array(translation), where)
-    camera_from_world = rigid(np.array(quaternion), np.array(translation), where)
-    return ModelImage(name, camera, invert(camera_from_world))
+    checked_place(place, where)
+    return ModelImage(name, camera, invert(rigid(np.array(values[:4]), place, where)))
 
 
 # --------------------------------------------------------------------------------------------------- binary
@@ -145,39 +120,34 @@ class _Reader:
     def __init__(self, buffer: mmap.mmap | bytes, path: Path) -> None:
         self.buffer, self.path, self.at, self.size = buffer, path, 0, len(buffer)
 
-    def take(self, layout: str) -> tuple[float, ...]:
-        length = struct.calcsize(layout)
-        if self.at + length > self.size:
-            raise self.short()
-        values = struct.unpack_from(layout, self.buffer, self.at)
-        self.at += length
-        return values
-
     def skip(self, count: int, width: int) -> None:
         if count * width > self.size - self.at:
-            raise self.short()
+            raise InputError(
+                f"{self.path} ends before its own counts (at byte {self.at} of {self.size}); copy or write the model again"
+            )
         self.at += count * width
+
+    def take(self, layout: str) -> tuple[float, ...]:
+        self.skip(1, struct.calcsize(layout))
+        return struct.unpack_from(layout, self.buffer, self.at - struct.calcsize(layout))
 
     def count(self, smallest: int) -> int:
         """A number of records, each at least `smallest` bytes long."""
-        value = int(self.take("<Q")[0])
-        if value * smallest > self.size - self.at:
-            raise self.short()
+        value, at = int(self.take("<Q")[0]), self.at
+        self.skip(value, smallest)
+        self.at = at
         return value
 
     def text(self) -> str:
         end = self.buffer.find(b"\0", self.at, min(self.size, self.at + 4096))
-        if end < 0:
-            raise InputError(f"{self.path} holds an image name without end; check how it was written")
-        raw = bytes(self.buffer[self.at : end])
+        raw = bytes(self.buffer[self.at : max(end, self.at)])
         self.at = end + 1
         try:
+            if end < 0:
+                raise ValueError
             return raw.decode("utf-8")
-        except UnicodeDecodeError as error:
-            raise InputError(f"{self.path} holds an image name that is not UTF-8; check how it was written") from error
-
-    def short(self) -> InputError:
-        return InputError(f"{self.path} ends before its own counts say (at byte {self.at} of {self.size}); copy or write the model again")
+        except ValueError as error:
+            raise InputError(f"{self.path} holds an image name without end, or not in UTF-8; check how it was written") from error
 
 
 @contextmanager
@@ -193,91 +163,69 @@ def _opened(path: Path) -> Iterator[_Reader]:
         raise InputError(f"cannot read {path}: {error.strerror or error}") from error
 
 
-def _cameras_bin(path: Path) -> dict[int, Intrinsics]:
-    out = {}
+def _cameras_bin(path: Path) -> Iterator[tuple[int, Intrinsics]]:
     with _opened(path) as reader:
         for _ in range(reader.count(24)):
             number, model, width, height = (int(value) for value in reader.take("<IiQQ"))
-            name = NAME_OF.get(model)
-            if name is None:
+            if not 0 <= model < len(MODELS):
                 raise InputError(f"{path}: camera {number} has the unknown model {model}; check how the file was written")
-            out[number] = intrinsics_of(name, width, height, list(reader.take(f"<{COUNT_OF[name]}d")), f"{path}, camera {number}")
-    return out
+            name, count, _ = MODELS[model]
+            yield number, intrinsics_of(name, width, height, list(reader.take(f"<{count}d")), f"{path}, camera {number}")
 
 
-def _images_bin(path: Path) -> list[ModelImage]:
-    out = []
+def _images_bin(path: Path) -> Iterator[ModelImage]:
     with _opened(path) as reader:
         for _ in range(reader.count(73)):
             values = reader.take("<I7dI")
             name = reader.text()
             reader.skip(reader.count(24), 24)
-            out.append(_image(name, int(values[8]), list(values[1:5]), list(values[5:8]), str(path)))
-    return out
+            yield _image(name, int(values[8]), list(values[1:8]), str(path))
 
 
-def _points_bin(path: Path) -> Array:
+def _points_bin(path: Path) -> Iterator[tuple[float, ...]]:
     with _opened(path) as reader:
-        count = reader.count(51)
-        points = np.empty((count, 3))
-        for index in range(count):
+        for _ in range(reader.count(51)):
             values = reader.take("<QdddBBBdQ")
-            points[index] = values[1:4]
+            yield values[1:4]
             reader.skip(int(values[8]), 8)
-    return points[np.isfinite(points).all(axis=1)]
 
 
 # --------------------------------------------------------------------------------------------------- text
 
 
-def _lines(path: Path) -> list[str]:
-    return read_text(path, MAX_TEXT).splitlines()
+@contextmanager
+def _line(path: Path, number: int) -> Iterator[None]:
+    """Around the parsing of a line, which is named where it fails."""
+    try:
+        yield
+    except (ValueError, IndexError) as error:
+        raise InputError(f"{path}, line {number + 1} cannot be read ({first_line(error)}); check how it was written") from error
 
 
-def _broken(path: Path, number: int, error: Exception) -> InputError:
-    return InputError(f"{path}, line {number + 1} cannot be read ({first_line(error)}); check how it was written")
-
-
-def _cameras_txt(path: Path) -> dict[int, Intrinsics]:
-    out = {}
-    for number, line in enumerate(_lines(path)):
+def _cameras_txt(path: Path) -> Iterator[tuple[int, Intrinsics]]:
+    for number, line in enumerate(read_text(path, MAX_TEXT).splitlines()):
         words = line.split()
-        if not words or words[0].startswith("#"):
-            continue
-        try:
-            camera, model, width, height = int(words[0]), words[1], int(words[2]), int(words[3])
-            values = [float(word) for word in words[4:]]
-        except (ValueError, IndexError) as error:
-            raise _broken(path, number, error) from error
-        out[camera] = intrinsics_of(model, width, height, values, f"{path}, camera {camera}")
-    return out
+        if words and not words[0].startswith("#"):
+            with _line(path, number):
+                camera, model, width, height = int(words[0]), words[1], int(words[2]), int(words[3])
+                values = [float(word) for word in words[4:]]
+            yield camera, intrinsics_of(model, width, height, values, f"{path}, camera {camera}")
 
 
-def _images_txt(path: Path) -> list[ModelImage]:
-    out = []
-    numbered = iter(enumerate(_lines(path)))
+def _images_txt(path: Path) -> Iterator[ModelImage]:
+    numbered = iter(enumerate(read_text(path, MAX_TEXT).splitlines()))
     for number, line in numbered:
         words = line.strip().split(maxsplit=9)
-        if not words or words[0].startswith("#"):
-            continue
-        next(numbered, None)  # the feature points of this image; the line may be blank
-        try:
-            values, camera, name = [float(word) for word in words[1:8]], int(words[8]), words[9]
-        except (ValueError, IndexError) as error:
-            raise _broken(path, number, error) from error
-        out.append(_image(name, camera, values[:4], values[4:], str(path)))
-    return out
+        if words and not words[0].startswith("#"):
+            next(numbered, None)  # the feature points of this image; the line may be blank
+            with _line(path, number):
+                values, camera, name = [float(word) for word in words[1:8]], int(words[8]), words[9]
+            yield _image(name, camera, values, str(path))
 
 
-def _points_txt(path: Path) -> Array:
-    rows = []
-    for number, line in enumerate(_lines(path)):
+def _points_txt(path: Path) -> Iterator[tuple[float, ...]]:
+    for number, line in enumerate(read_text(path, MAX_TEXT).splitlines()):
         words = line.split(maxsplit=4)
-        if not words or words[0].startswith("#"):
-            continue
-        try:
-            rows.append([float(words[1]), float(words[2]), float(words[3])])
-        except (ValueError, IndexError) as error:
-            raise _broken(path, number, error) from error
-    points = np.array(rows, dtype=np.float64).reshape(-1, 3)
-    return points[np.isfinite(points).all(axis=1)]
+        if words and not words[0].startswith("#"):
+            with _line(path, number):
+                yield float(words[1]), float(words[2]), float(words[3])

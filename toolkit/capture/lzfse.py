@@ -1,6 +1,6 @@
-"""Maps that are compressed by LZFSE, Apple's own, as Record3D writes depth (`.depth`: float32) and confidence (`.conf`: uint8).
+"""Maps compressed by Apple's LZFSE, as Record3D writes depth (`.depth`: float32) and confidence (`.conf`: uint8).
 
-imagecodecs reads it, and is asked for when the first such capture comes, so that all else works without it.
+imagecodecs reads them; it is imported with the first such capture, so that all else works without it.
 """
 
 from __future__ import annotations
@@ -11,50 +11,38 @@ from typing import Any
 import numpy as np
 
 from fieldfuse.camera import Array
-from fieldfuse.capture.headers import read_bytes
+from fieldfuse.capture.archive import read_bytes
 from fieldfuse.errors import InputError
 
 TYPES: dict[str, np.dtype[Any]] = {".depth": np.dtype("<f4"), ".conf": np.dtype("u1")}
-MOST_PIXELS = 4_000_000  # of a map whose size is not told: the largest is the front camera's, 720×960
+MOST_PIXELS = 4_000_000  # of a map of unknown size: the largest is the front camera's, 720×960
 
 
 def require(path: Path) -> Any:
-    """The package that reads LZFSE, for `path`.
-
-    Raises:
-        InputError: it is not installed.
-    """
+    """The package that reads LZFSE, for `path`."""
     try:
         import imagecodecs
 
-        _ = imagecodecs.lzfse_decode  # built without it, it says so here
+        _ = imagecodecs.lzfse_decode  # absent where it was built without
     except (ImportError, AttributeError) as error:
         raise InputError(
             f"the depth of {path} is compressed by LZFSE, which needs the package imagecodecs; install it (pip install imagecodecs), "
-            "or give the pictures alone, unpacked into a folder"
+            "or give the images alone, unpacked into a folder"
         ) from error
     return imagecodecs
 
 
 def load_map(path: Path, width: int, height: int) -> Array:
-    """The map in a `.depth` or `.conf` file, (height, width), float32 or uint8 as its suffix says.
-
-    Raises:
-        InputError: it cannot be read, is damaged, or has another number of pixels; the decoder is not installed.
-    """
+    """The map in a `.depth` or `.conf` file, (height, width), float32 or uint8 by its suffix."""
     kind = TYPES[path.suffix.lower()]
     data = _inflated(path, width * height * kind.itemsize)
     if len(data) != width * height * kind.itemsize:
-        raise InputError(f"{path} does not hold the {width}×{height} values that its recording tells; record or export it again")
+        raise InputError(f"{path} does not hold the {width}×{height} values of its recording; record or export it again")
     return np.frombuffer(data, kind).reshape(height, width)
 
 
 def count_pixels(path: Path) -> int:
-    """How many values a map holds whose size nothing tells.
-
-    Raises:
-        InputError: as `load_map`; it holds more than `MOST_PIXELS`.
-    """
+    """How many values a map of unknown size holds."""
     kind = TYPES[path.suffix.lower()]
     size = len(_inflated(path, MOST_PIXELS * kind.itemsize))
     if size > MOST_PIXELS * kind.itemsize or size % kind.itemsize:
@@ -63,7 +51,7 @@ def count_pixels(path: Path) -> int:
 
 
 def _inflated(path: Path, most: int) -> bytes:
-    """What `path` inflates to; of more than `most` bytes one beyond them. The decoder stops where the memory given to it ends."""
+    """What `path` inflates to, and one byte more than `most` at most: the decoder stops where the memory given to it ends."""
     codecs = require(path)
     data = read_bytes(path)
     try:

@@ -1,16 +1,17 @@
-"""Bundle adjustment of points with exactly those other unknowns that are asked for: a lens, rows one after the other, poses.
+"""Bundle adjustment of points with chosen other unknowns: a lens, rows one after the other, poses.
 
 Observation o of point X in frame f, q_o on the ideal image plane, is predicted as
 
     c = exp(−w_f) (R_fᵀ (X − t_f) − d_f),   c' = c − u_o·(Ω_f × c + V_f),   x = c'_xy / c'_z,   q = x·(1 + k1·r² + k2·r⁴)
 
-(w_f, d_f): correction of a pose in its own axes; (k1, k2): the lens beyond what the capture tells; u_o: the row's share of
+(w_f, d_f): correction of a pose in its own axes; (k1, k2): the lens beyond the capture's own; u_o: the row's share of
 the height, −1/2 to 1/2, and (Ω_f, V_f): how far the camera turns and moves while the rows of frame f are read. Levenberg-Marquardt with
 Huber's weights; points are eliminated by the Schur complement (Triggs et al. 2000, section 6).
 """
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -69,7 +70,7 @@ class Problem:
 
 @dataclass(frozen=True)
 class Belief:
-    """Where cameras are before pictures are looked at, and how sure that is."""
+    """Where cameras are before images are looked at, and how sure that is."""
 
     poses: Array  # (F, 4, 4)
     weight: Array  # (6,) working pixels² that a square of a turn (radians, camera axes) and of a move costs
@@ -125,7 +126,7 @@ def scatter(residual: Array) -> float:
 
 
 def uncertainty(problem: Problem) -> Array:
-    """(O,) deviation of points along the viewing direction of the pictures that show them, by how well rays meet; units of the poses."""
+    """(O,) deviation of points along the viewing direction of the images that show them, by how well rays meet; units of the poses."""
     by_point = _slopes(replace(problem, depth=None), frozenset())[0]
     count = len(problem.points)
     ends = np.searchsorted(problem.point, np.arange(count))
@@ -138,26 +139,31 @@ def uncertainty(problem: Problem) -> Array:
 
 def adjust(problem: Problem, unknown: frozenset[str] = frozenset(), steps: int = STEPS, belief: Belief | None = None) -> Fitted:
     """Fit the points and what is `unknown` beside them; poses that are unknown stay near those of `belief`, if there is one."""
-    damping, current = 1e-3, problem
-    left = _left(current)
-    width = TUNING * max(scatter(left[:, :2]), 1e-3)
-    cost = _cost(left, width, current, belief)
+    fitted, left = _descend(problem, lambda now, left, width, damping: _step(now, left, width, unknown, damping, belief), steps, 5, belief)
+    return Fitted(fitted, left[:, :2], scatter(left[:, :2]))
+
+
+def _descend(
+    current: Problem, step: Callable[[Problem, Array, float, float], Problem], steps: int, ease: float, belief: Belief | None = None
+) -> tuple[Problem, Array]:
+    """Levenberg-Marquardt: the problem after damped steps, and what is left then. A `step` takes what is left before it, Huber's width and
+    the damping, which is divided by `ease` where the cost falls."""
+    left, damping = _left(current), 1e-3
     for _ in range(steps):
-        moved = _step(current, left, width, unknown, damping, belief)
+        width = TUNING * max(scatter(left[:, :2]), 1e-3)
+        cost = _cost(left, width, current, belief)
+        moved = step(current, left, width, damping)
         new = _left(moved)
         value = _cost(new, width, moved, belief) if np.isfinite(moved.poses).all() else np.inf
-        if not value < cost:
+        if value < cost:
+            current, left, damping = moved, new, max(damping / ease, 1e-7)
+            if value > (1 - SLACK) * cost:
+                break
+        else:
             damping *= 10
             if damping > 1e4:
                 break
-            continue
-        done = value > (1 - SLACK) * cost
-        current, left, damping = moved, new, max(damping / 5, 1e-7)
-        width = TUNING * max(scatter(left[:, :2]), 1e-3)
-        cost = _cost(left, width, current, belief)
-        if done:
-            break
-    return Fitted(current, left[:, :2], scatter(left[:, :2]))
+    return current, left
 
 
 def _left(problem: Problem) -> Array:
@@ -166,10 +172,10 @@ def _left(problem: Problem) -> Array:
     return seen if problem.depth is None else np.column_stack([seen, depth_residuals(problem)])
 
 
-def _cost(residual: Array, width: float, problem: Problem | None = None, belief: Belief | None = None) -> float:
+def _cost(residual: Array, width: float, problem: Problem, belief: Belief | None) -> float:
     """Huber's cost, and that of the belief, over the number of residuals."""
     size = _sizes(residual)
-    held = belief.cost(problem.poses) / max(len(size), 1) if belief is not None and problem is not None else 0.0
+    held = belief.cost(problem.poses) / max(len(size), 1) if belief is not None else 0.0
     return float(np.where(size < width, 0.5 * size**2, width * (size - 0.5 * width)).sum(axis=1).mean()) + held
 
 
@@ -253,7 +259,8 @@ def _slopes(problem: Problem, unknown: frozenset[str]) -> tuple[Array, Array, Ar
     parts, columns = [], []
     frames = len(problem.poses)
     first = 0
-    rigid = np.concatenate([np.einsum("oac,ocd->oad", by_place, _cross(camera)), -by_place], axis=2)  # of (w, d)
+    turned = np.stack([np.cross(camera, axis) for axis in np.eye(3)], axis=2)  # (O, 3, 3) by turns about the camera's axes
+    rigid = np.concatenate([np.einsum("oac,ocd->oad", by_place, turned), -by_place], axis=2)  # of (w, d)
     if POSES in unknown:
         parts.append(rigid)
         columns.append(6 * problem.frame[:, None] + np.arange(6))
@@ -292,13 +299,6 @@ def _with(problem: Problem, step: Array, unknown: frozenset[str]) -> Problem:
     return problem
 
 
-def _cross(v: Array) -> Array:
-    """(N, 3) → (N, 3, 3) with [v] w = v × w."""
-    x, y, z = v.T
-    zero = np.zeros_like(x)
-    return np.asarray(np.stack([zero, -z, y, z, zero, -x, -y, x, zero], axis=1).reshape(-1, 3, 3))
-
-
 def resect(problem: Problem, frame: int) -> tuple[Array, Array]:
     """The pose of one frame against points that stay where they are, by damped Gauss-Newton steps from the pose it has.
 
@@ -317,23 +317,14 @@ def resect(problem: Problem, frame: int) -> tuple[Array, Array]:
         motion=problem.motion[[frame]],
         depth=None,
     )
-    left, damping = residuals(alone), 1e-3
-    for _ in range(RESECTION_STEPS):
-        width = TUNING * max(scatter(left), 1e-3)
-        _, slope, _, _ = _slopes(alone, frozenset({POSES}))
+
+    def step(now: Problem, left: Array, width: float, damping: float) -> Problem:
+        _, slope, _, _ = _slopes(now, frozenset({POSES}))
         weight = _weights(left, width)
         matrix = np.einsum("oa,oac,oad->cd", weight, slope, slope)
-        downhill = np.einsum("oa,oac,oa->c", weight, slope, left)
         matrix[np.diag_indices(6)] *= 1 + damping
-        moved = _with(alone, -np.linalg.solve(matrix + 1e-9 * np.trace(matrix) * np.eye(6), downhill), frozenset({POSES}))
-        new = residuals(moved)
-        before, after = _cost(left, width), _cost(new, width)
-        if not after < before:
-            damping *= 10
-            if damping > 1e4:
-                break
-            continue
-        alone, left, damping = moved, new, max(damping / 10, 1e-7)
-        if after > (1 - SLACK) * before:
-            break
+        matrix += 1e-9 * np.trace(matrix) * np.eye(6)
+        return _with(now, -np.linalg.solve(matrix, np.einsum("oa,oac,oa->c", weight, slope, left)), frozenset({POSES}))
+
+    alone, left = _descend(alone, step, RESECTION_STEPS, 10)
     return np.asarray(alone.poses[0]), np.linalg.norm(left, axis=1)

@@ -1,7 +1,7 @@
 """What is taken out of a capture before anything is fitted to it, as plain data: colours, the lens, errors of poses, weights.
 
-Gains have geometric mean 1 over the training pictures, the vignetting is 1 in the middle, refined poses are held to the given ones
-(`refine.believed`): every freedom that pictures cannot tell is fixed. What would then be too bright for a picture is made room for
+Gains have geometric mean 1 over the training images, the vignetting is 1 in the middle, refined poses are held to the given ones
+(`refine.believed`): every freedom that images do not decide is fixed. What would then be too bright for an image is made room for
 (`dimmed`). Where nothing is to be corrected, the very same objects come back. What no camera explains is not corrected (`beyond`,
 `beyond_depth`, `bounded_gains`), whatever evidence speaks for it.
 """
@@ -37,7 +37,7 @@ class Corrections:
     lens: tuple[float, float] | None = None  # k1, k2 beyond the given lens
     poses: dict[str, Array] = field(default_factory=dict)  # (4, 4) world_from_camera
     weight: dict[str, float] = field(default_factory=dict)  # of frames that count for less in the fit: share of their pixels, 0 to 1
-    depth: Array | None = None  # (4, 4) the picture's camera from the depth camera, where depth was not brought to the pictures
+    depth: Array | None = None  # (4, 4) the image's camera from the depth camera, where depth was not brought to the images
     by_depth: bool = False  # whether a sensor's depth took part in the poses
 
     @property
@@ -157,7 +157,7 @@ def correctable(camera: Intrinsics) -> bool:
 
 
 def bent(camera: Intrinsics, lens: tuple[float, float]) -> Intrinsics:
-    """The camera with k1, k2 applied to ideal points before its own lens; what is both is fitted over the picture by least squares."""
+    """The camera with k1, k2 applied to ideal points before its own lens; what is both is fitted over the image by least squares."""
     k1, k2 = lens
     if not camera.distorted:
         return replace(camera, lens=OPENCV, distortion=(k1, k2, 0.0, 0.0))

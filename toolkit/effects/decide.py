@@ -2,7 +2,7 @@
 
 What evidence speaks for is corrected only if three guards let it pass: no correction is larger than cameras explain (`correct.beyond`),
 held-out frames are placed by their own points or like their neighbours (`refine`), and a short fit to some training frames shows others
-better with it than without (`Trial`). What the user switches on by name is corrected whatever the guards say.
+better with it than without (`Trial`). What the user switches on by name is corrected whatever the guards find.
 """
 
 from __future__ import annotations
@@ -22,8 +22,8 @@ from fieldfuse.effects.adjust import LENS, POSES, ROWS, adjust, predict
 from fieldfuse.effects.correct import Corrections, beyond, beyond_depth, bounded_gains, correctable
 from fieldfuse.effects.depth_camera import DEPTH_OFFSET, UNKNOWN, look_for_offset
 from fieldfuse.effects.depth_pose_refinement import DepthRefined
-from fieldfuse.effects.diagnostics import FAR, POINTS, VIEWS, Diagnostics, Finding, Timing, diagnose
-from fieldfuse.effects.evidence import BLUR
+from fieldfuse.effects.diagnostics import FAR, POINTS, VIEWS, Diagnostics, Timing, diagnose
+from fieldfuse.effects.evidence import BLUR, Finding
 from fieldfuse.effects.light import EXPOSURE, VIGNETTING
 from fieldfuse.effects.refine import refined_poses
 from fieldfuse.effects.tracks import Look, Tracks, gather
@@ -37,7 +37,7 @@ LEAST_WEIGHT = 0.1
 CLIPS = 0.01  # share of the pixels that corrections may make too bright for an image …
 DIMMEST = 2.0  # … unless all would have to become darker than by this
 STRIDE = 4  # working pixels between those that are looked at
-OF_FIELD = {  # no correction of pictures, but what the field is made of
+OF_FIELD = {  # no correction of images, but what the field is made of
     VIEWS: "what the decoder sees of the direction: field.view",
     FAR: "whether space beyond the region is modelled is decided with the scene (field.background)",
 }
@@ -244,7 +244,7 @@ def choose_field(field: FieldSettings, effects: list[dict[str, Any]], off: Seque
     """Set what is left to `auto` in `field` by the decisions (as in `Decision.to_dict`); the scene decides on a background not found.
 
     Args:
-        off: effects that are off by name. (That nothing is to be corrected, `effects.mode=off`, says nothing about the field.)
+        off: effects that are off by name. (That nothing is to be corrected, `effects.mode=off`, does not concern the field.)
     """
     for entry in effects:
         name, unwanted = entry["effect"], entry["effect"] in off
@@ -351,7 +351,7 @@ def _by_name(names: Sequence[str], gains: Array) -> dict[str, Gain]:
 
 
 def room_for_light(seen: Tracks | None, corner: float | None, gain: dict[str, Gain]) -> float:
-    """What canonical light is divided by so that hardly any of it is too bright for a picture, `DIMMEST` at most: what is clipped there
+    """What canonical light is divided by so that hardly any of it is too bright for an image, `DIMMEST` at most: what is clipped there
     is lost, and agrees with no photo that shows it because it was exposed less."""
     if seen is None or not (gain or corner is not None):
         return 1.0

@@ -17,12 +17,13 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from fieldfuse.camera import Array, Intrinsics, distort, invert
+from fieldfuse.capture.calibration import fitted
 from fieldfuse.capture.images import load_depth
-from fieldfuse.capture.sizes import fitted
 from fieldfuse.capture.types import Capture
 from fieldfuse.effects import geometry
 from fieldfuse.effects.adjust import Problem, adjust, predict, residuals, uncertainty
-from fieldfuse.effects.diagnostics import CLOSE, FIRST_FRAMES, MOST_FRAMES, Finding
+from fieldfuse.effects.diagnostics import CLOSE, FIRST_FRAMES, MOST_FRAMES
+from fieldfuse.effects.evidence import Finding
 from fieldfuse.effects.tracks import Look, Tracks, choose, gather
 from fieldfuse.poses.cloud import every
 from fieldfuse.poses.points import undistorted
@@ -192,7 +193,7 @@ def look_for_offset(
         capture: with the poses and lenses that depth is going to be used with.
         train: frames that may be looked at.
         seen: what was found in its images, whatever poses and lenses it had then; a quick look at few of them is followed by a closer
-            one where it comes near to speaking for an offset, or tells nothing.
+            one where it comes near to speaking for an offset, or finds nothing.
 
     Raises:
         InputError: an image or a depth map cannot be read.

@@ -1,8 +1,8 @@
-"""Refined poses that agree with a sensor's depth: where images hardly tell a turn from a move, nor the scale, depth does.
+"""Refined poses that agree with a sensor's depth: where images hardly separate a turn from a move, nor the scale, depth does.
 
     least Σ ρ(q̂ − q) + Σ ρ(w·(ẑ / z − 1)) + belief,    w = scatter of places / scatter of depths
 
-q: where points are seen; z: their depth as the sensor measures it (`adjust.Problem.depth`), with its camera where points say it stands
+q: where points are seen; z: their depth as the sensor measures it (`adjust.Problem.depth`), with its camera where points place it
 (`depth_camera`); w follows from what both leave, so that a coarse sensor counts little. Poses, points and the sensor's camera are found in
 turns. Two things judge: what one depth map sees has to be where others see it, better than before; and where points are seen must not
 be explained worse by the cameras.
@@ -57,7 +57,7 @@ class DepthRefined:
 def refine_by_depth(
     capture: Capture, problem: Problem, unknown: frozenset[str], belief: Belief, progress: Progress = SILENT
 ) -> DepthRefined | None:
-    """The problem where depth takes part; None: depth tells nothing, or does not agree with the images.
+    """The problem where depth takes part; None: there is too little depth, or it does not agree with the images.
 
     Args:
         capture: whose frames are those of the problem, in their order.

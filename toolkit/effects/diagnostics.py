@@ -14,7 +14,7 @@ from fieldfuse.camera import Array
 from fieldfuse.capture.types import Capture
 from fieldfuse.effects import geometry, light
 from fieldfuse.effects.adjust import LENS, POSES, ROWS, predict
-from fieldfuse.effects.evidence import BLUR, HeldOut, blur_evidence
+from fieldfuse.effects.evidence import BLUR, Finding, blur_evidence
 from fieldfuse.effects.far_background import find_far_background
 from fieldfuse.effects.light import EXPOSURE, VIGNETTING
 from fieldfuse.effects.specularity import find_specularity
@@ -49,35 +49,6 @@ class Timing:
     def of(self, effect: str) -> float:
         """Seconds, to the millisecond."""
         return round(self.seconds.get(effect, 0.0), 3)
-
-
-@dataclass(frozen=True)
-class Finding:
-    """What was found about one effect, and whether it is there."""
-
-    effect: str
-    number: float
-    threshold: float
-    reason: str
-    there: bool  # the number is above its threshold, and held-out points agree by a margin
-    before: float | None = None  # what held-out points are off without the effect, in `unit`; None where nothing is fitted
-    after: float | None = None  # and with it
-    unit: str = ""
-
-    def to_dict(self) -> dict[str, Any]:
-        out: dict[str, Any] = {
-            "effect": self.effect,
-            "number": round(float(self.number), 4),
-            "threshold": self.threshold,
-            "there": bool(self.there),  # NumPy's own truth values are not JSON
-            "reason": self.reason,
-        }
-        if self.before is not None and self.after is not None:
-            before, after = float(self.before), float(self.after)
-            out["held_out"] = {"before": round(before, 4), "after": round(after, 4), "unit": self.unit}
-            if before > 0 and after > 0:
-                out["held_out"]["decibels"] = round(20 * float(np.log10(before / after)), 2)
-        return out
 
 
 @dataclass(frozen=True)
@@ -157,12 +128,12 @@ def diagnose_tracks(seen: Tracks, began: float | None = None, timing: Timing | N
     with timing.by(BLUR):
         blur = blur_evidence(kept.slope, depth, kept.frame, kept.point, frames, kept.linear)
     with timing.by(VIEWS):
-        views = _of_patches(find_specularity(kept, explained.problem, depth, found))
+        views = find_specularity(kept, explained.problem, depth, found)
     with timing.by(FAR):
         usual = float(np.median(depth[depth > 0])) if (depth > 0).any() else 0.0
-        far = _of_patches(find_far_background(seen, explained.problem, usual))
+        far = find_far_background(seen, explained.problem, usual)
     findings = {
-        **{name: _of_light(found, name) for name in (EXPOSURE, VIGNETTING)},
+        **{name: found.finding(name) for name in (EXPOSURE, VIGNETTING)},
         LENS: _lens(explained),
         ROWS: _rows(explained, seen.times),
         VIEWS: views,
@@ -174,18 +145,6 @@ def diagnose_tracks(seen: Tracks, began: float | None = None, timing: Timing | N
     points, observations = len(explained.problem.points), len(explained.observation)
     facts = {"frames": frames, "points": points, "observations": observations, "points_seconds": timing.of(POINTS)}
     return Diagnostics(findings, seen, explained, found, sharpness, time.monotonic() - began, facts, timing)
-
-
-def _of_patches(held_out: HeldOut) -> Finding:
-    evidence = held_out.evidence
-    before, after = held_out.before, held_out.after
-    return Finding(evidence.effect, evidence.number, evidence.threshold, evidence.reason, held_out.found, before, after, "stops")
-
-
-def _of_light(found: light.Light, name: str) -> Finding:
-    evidence = found.evidence[name]
-    before, after = found.before[name], found.after[name]
-    return Finding(name, evidence.number, evidence.threshold, evidence.reason, name in found.kept, before, after, "stops")
 
 
 def _of_points(name: str, choice: geometry.Choice, reason: str, there: bool) -> Finding:

@@ -39,17 +39,32 @@ class Evidence:
 
 
 @dataclass(frozen=True)
-class HeldOut:
-    """Evidence from patches of images, and how well it predicts held-out images."""
+class Finding:
+    """What was found about one effect, and whether it is there."""
 
-    evidence: Evidence
-    least: float  # relative fall of the error that counts
-    before: float | None = None  # stops: error of the patches in held-out images without the effect; None: there are none
+    effect: str
+    number: float
+    threshold: float
+    reason: str
+    there: bool  # the number is above its threshold, and held-out points agree by a margin
+    before: float | None = None  # what held-out points are off without the effect, in `unit`; None where nothing is fitted
     after: float | None = None  # and with it
+    unit: str = ""
 
-    @property
-    def found(self) -> bool:
-        return self.evidence.found and self.before is not None and self.after is not None and self.after < (1 - self.least) * self.before
+    def to_dict(self) -> dict[str, Any]:
+        out: dict[str, Any] = {
+            "effect": self.effect,
+            "number": round(float(self.number), 4),
+            "threshold": self.threshold,
+            "there": bool(self.there),  # NumPy's own truth values are not JSON
+            "reason": self.reason,
+        }
+        if self.before is not None and self.after is not None:
+            before, after = float(self.before), float(self.after)
+            out["held_out"] = {"before": round(before, 4), "after": round(after, 4), "unit": self.unit}
+            if before > 0 and after > 0:
+                out["held_out"]["decibels"] = round(20 * float(np.log10(before / after)), 2)
+        return out
 
 
 def without_points_and_frames(values: Array, frame: Array, point: Array, weight: Array, frames: int) -> tuple[Array, Array]:
@@ -84,7 +99,7 @@ def without_points_and_frames(values: Array, frame: Array, point: Array, weight:
 
 
 def robust_weights(residual: Array) -> Array:
-    """Huber's weights (O,) for residuals (O,) or (O, C), whose deviation is told by the median (1.4826 · MAD)."""
+    """Huber's weights (O,) for residuals (O,) or (O, C), whose deviation is that of the median (1.4826 · MAD)."""
     size = np.abs(residual) if residual.ndim == 1 else np.linalg.norm(residual, axis=1) / np.sqrt(residual.shape[1])
     deviation = 1.4826 * float(np.median(size)) if len(size) else 0.0
     return np.minimum(1.0, TUNING * max(deviation, 1e-9) / np.maximum(size, 1e-12))
@@ -104,7 +119,7 @@ BLUR = "motion_blur"
 BLURRED = 0.033  # factors of two of the slopes' energy
 FEWEST_SLOPES = 100  # observations
 DARK, BRIGHT = 0.02, 0.6  # linear light of a patch: noise and clipping change slopes too, and exposure decides how much
-TREND = 8  # frames from which on a slow trend is told from blur, which comes and goes
+TREND = 8  # frames from which on a slow trend is separated from blur, which comes and goes
 
 
 def _sharpness(energy: Array, distance: Array, frame: Array, point: Array, frames: int) -> tuple[Array, Array, Array]:
@@ -128,7 +143,7 @@ def blur_evidence(slope: Array, depth: Array, frame: Array, point: Array, frames
 
     Args:
         slope: (O,) mean square of the slopes of log light round the observation. depth: (O,) along z. frame, point: (O,).
-        linear: (O, 3) light of the patch, as it was stored; what is dark or bright is left out.
+        linear: (O, 3) light of the patch, as it was stored; what is dark or bright is excluded.
 
     Returns:
         `parameters["sharpness"]`: (frames,) factors of two of the energy, mean 0; 0 where nothing was measured.

@@ -6,7 +6,7 @@ the inverse depth ρ and both patches without their mean (in log light, so that 
 
     c_s(ρ) = mean (P_s(w_ρ) − P_r)²,        a_s = mean (P_r shifted by the parallax of ρ₁ − P_r)²
 
-with ρ₁ = 1 / (NEAR_LIMIT · usual depth). A patch *tells* when a is large: it would look different if it were nearer. It is *far* when
+with ρ₁ = 1 / (NEAR_LIMIT · usual depth). A patch is *informative* when a is large: nearer it would look different. It is *far* when
 c(0) is small beside a, beside c at every nearer ρ, and beside the patch's own contrast. Half of the images s decide that; the other
 half shows how much worse the best nearer place explains them.
 """
@@ -21,15 +21,15 @@ import numpy as np
 
 from fieldfuse.camera import Array, distort
 from fieldfuse.effects.adjust import Problem
-from fieldfuse.effects.evidence import Evidence, HeldOut, median_of_finite
+from fieldfuse.effects.evidence import Finding, median_of_finite
 from fieldfuse.effects.tracks import Tracks
 from fieldfuse.poses.cloud import every
 from fieldfuse.poses.points import undistorted
 from fieldfuse.tone import LINEAR
 
-THRESHOLD = 0.002  # share of the patches that tell
+THRESHOLD = 0.002  # share of the informative patches
 MIN_FAR = 5  # far ones: fewer may be chance
-FEWEST = 50  # patches that tell
+FEWEST = 50  # informative patches
 NEAR_LIMIT = 10.0  # times as far as the scene usually is
 REFERENCES, OTHERS = 8, 8  # images whose patches are looked at, and in how many others each
 TURN = 25.0  # degrees between the axes of images that are compared
@@ -43,14 +43,14 @@ AROUND = np.stack(np.meshgrid(*[np.arange(-HALF, HALF + 1)] * 2), axis=-1).resha
 GAIN = 0.3  # least relative fall of the held-out error
 
 
-def find_far_background(seen: Tracks, problem: Problem, usual: float) -> HeldOut:
+def find_far_background(seen: Tracks, problem: Problem, usual: float) -> Finding:
     """Look at patches of some images in others.
 
     Args:
         problem: cameras that explain what is seen (`geometry.Explained.problem`): poses, lens and rows. usual: median depth of the points.
     """
     near = 1 / max(NEAR_LIMIT * usual, 1e-12)
-    tells, distant, errors = 0, 0, np.zeros((0, 2))
+    informative, distant, errors = 0, 0, np.zeros((0, 2))
 
     @cache
     def image(index: int) -> Array:
@@ -59,15 +59,16 @@ def find_far_background(seen: Tracks, problem: Problem, usual: float) -> HeldOut
     for one in every(len(seen.images), REFERENCES):
         others = _others(problem.poses, int(one))
         if len(others) >= 4:
-            told, gone, off = _compared(seen, problem, near, int(one), others, image)
-            tells, distant, errors = tells + told, distant + gone, np.concatenate([errors, off])
-    share = distant / tells if tells >= FEWEST and distant >= MIN_FAR else 0.0
+            these, gone, off = _compared(seen, problem, near, int(one), others, image)
+            informative, distant, errors = informative + these, distant + gone, np.concatenate([errors, off])
+    share = distant / informative if informative >= FEWEST and distant >= MIN_FAR else 0.0
     before, after = (float(value) for value in np.sqrt(np.median(errors, axis=0))) if len(errors) else (None, None)
+    there = share > THRESHOLD and before is not None and after is not None and after < (1 - GAIN) * before
     reason = (
         f"{100 * share:.1f}% of the patches lie more than {2 * NEAR_LIMIT:g} times as far as the scene usually is: other pictures show them"
         f" where infinity would be; {100 * THRESHOLD:.1f}% or more speak for a distant background"
     )
-    return HeldOut(Evidence("background", share, THRESHOLD, reason), GAIN, before, after)
+    return Finding("background", share, THRESHOLD, reason, there, before, after, "stops")
 
 
 def _others(poses: Array, one: int) -> Array:
@@ -83,7 +84,7 @@ def _others(poses: Array, one: int) -> Array:
 def _compared(
     seen: Tracks, problem: Problem, near: float, one: int, others: Array, image: Callable[[int], Array]
 ) -> tuple[int, int, Array]:
-    """Patches of image `one` that tell, those that are far, and (N, 2) squared stops: errors of the far ones in held-out images."""
+    """Informative patches of image `one`, those that are far, and (N, 2) squared stops: errors of the far ones in held-out images."""
     own = image(one)
     pixels, patch = _patches(own)
     if not len(pixels):
@@ -106,10 +107,10 @@ def _compared(
     variance = (patch**2).mean(1)
     enough = (np.isfinite(infinity[fit]).sum(0) >= 2) & (np.isfinite(infinity[~fit]).sum(0) >= 2)
     shift, zero = median_of_finite(alike[fit], 2), median_of_finite(infinity[fit], 2)
-    tell = enough & (shift > CONTRAST) & (shift > 0.1 * variance)
-    maybe = np.flatnonzero(tell & (zero < SAME * shift) & (zero < OWN * variance))
+    informative = enough & (shift > CONTRAST) & (shift > 0.1 * variance)
+    maybe = np.flatnonzero(informative & (zero < SAME * shift) & (zero < OWN * variance))
     if not len(maybe):
-        return int(tell.sum()), 0, np.zeros((0, 2))
+        return int(informative.sum()), 0, np.zeros((0, 2))
     errors = np.full((len(STEPS), len(others), len(maybe)), np.nan)
     for k, other in enumerate(others):
         for n, step in enumerate(STEPS):
@@ -121,7 +122,7 @@ def _compared(
     after = median_of_finite(infinity[~fit], 2)[maybe[gone]]
     before = median_of_finite(errors[best[gone][None], np.flatnonzero(~fit)[:, None], gone[None]], 2)
     both = np.stack([before, after], axis=1)
-    return int(tell.sum()), len(gone), both[np.isfinite(both).all(1)]
+    return int(informative.sum()), len(gone), both[np.isfinite(both).all(1)]
 
 
 def _patches(own: Array) -> tuple[Array, Array]:

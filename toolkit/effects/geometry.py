@@ -36,8 +36,6 @@ class Explained:
     problem: Problem  # all points, with the cameras that explain them
     kept: frozenset[str]
     choices: dict[str, Choice]
-    scatter: float  # working pixels, of held-out points, as the capture stands
-    left: float  # the same with what was kept
     observation: Array  # (O',) which of the tracks' observations the problem's are
     profile: list[float] = field(default_factory=list)  # radial residual at five radii, working pixels, before anything is explained
 
@@ -109,8 +107,7 @@ def explain(seen: Tracks) -> Explained | None:
     out = np.arange(len(whole.points)) % HELD_OUT == HELD_OUT // 2
     fit, held = whole.only(~out), whole.only(out)
     held = adjust(held).problem
-    start = scatter(residuals(held))
-    tried: dict[frozenset[str], tuple[float, Problem]] = {frozenset(): (start, whole)}
+    tried: dict[frozenset[str], tuple[float, Problem]] = {frozenset(): (scatter(residuals(held)), whole)}
 
     def attempt(unknown: frozenset[str]) -> float:
         if unknown not in tried:
@@ -127,9 +124,8 @@ def explain(seen: Tracks) -> Explained | None:
         both = [frozenset(UNKNOWNS) - {name} for name in UNKNOWNS]
         kept = min([*list(tried), *both, frozenset(UNKNOWNS)], key=score)
     choices = {name: Choice(attempt(kept - {name}), attempt(kept | {name}), name in kept) for name in UNKNOWNS}
-    value, base = tried[kept]
-    problem = adjust(whole.like(base)).problem
-    return Explained(problem, kept, choices, start, value, used, _profile(seen, used, before.problem, before.residual))
+    problem = adjust(whole.like(tried[kept][1])).problem
+    return Explained(problem, kept, choices, used, _profile(seen, used, before.problem, before.residual))
 
 
 def _profile(seen: Tracks, used: Array, problem: Problem, residual: Array) -> list[float]:

@@ -7,7 +7,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from fieldfuse.camera import Array
-from fieldfuse.effects.evidence import ROUNDS, Evidence, robust_weights, without_points_and_frames
+from fieldfuse.effects.evidence import ROUNDS, Evidence, Finding, robust_weights, without_points_and_frames
 from fieldfuse.tone import share
 
 EXPOSURE, VIGNETTING = "exposure", "vignetting"
@@ -15,7 +15,7 @@ DARKEST, BRIGHTEST = 0.01, 0.85  # linear light between which a color shows its 
 DRIFTS, DIMS = 0.04, 0.05  # thresholds: stops; share of the light that corners lose
 FEWEST_GAINS, FEWEST_FALLS = 30, 60  # observations without which nothing is known of exposure and of vignetting
 STRONGEST = 20.0  # of a in V(r) = (1 + a·r²)⁻²: a corner with a four-hundredth of the light
-HELD_OUT = 4  # every n-th point is kept out of the fits
+HELD_OUT = 4  # every n-th point is held out of the fits
 MARGIN = {EXPOSURE: 0.24, VIGNETTING: 0.1}  # least relative fall of the held-out deviation: less did not pay on real captures
 BOTH = 0.25  # … by both: each hides some of the other, so that alone neither may come as far as it does beside the other
 MIN_FALL = 0.0015  # stops by which it has to fall at least
@@ -62,8 +62,12 @@ class Light:
     kept: frozenset[str]
     before: dict[str, float]  # stops: the deviation of held-out points without the effect, beside what else is kept
     after: dict[str, float]  # and with it
-    gain: Array  # (frames, 3) gains of the frames, geometric mean 1, with the vignetting taken out first when it is kept
     corner: float  # share of the light that is left at half a diagonal
+
+    def finding(self, name: str) -> Finding:
+        """About exposure or vignetting."""
+        one = self.evidence[name]
+        return Finding(name, one.number, one.threshold, one.reason, name in self.kept, self.before[name], self.after[name], "stops")
 
 
 def exposure_evidence(tracks: LightTracks, frames: int) -> Evidence:
@@ -138,7 +142,8 @@ def explain(tracks: LightTracks, frames: int) -> Light:
         for kept in deviations
         if (VIGNETTING not in kept or falloff.found) and (EXPOSURE not in kept or found[kept - {EXPOSURE}].found)
     ]
-    kept = min(allowed, key=lambda one: deviations[one] / (1 - _margin(one)) + MIN_FALL * len(one))
+    margin = {kept: BOTH if len(kept) > 1 else sum(MARGIN[name] for name in kept) for kept in allowed}
+    kept = min(allowed, key=lambda one: deviations[one] / (1 - margin[one]) + MIN_FALL * len(one))
     final = vignetting_evidence(tracks, frames)
     corner = float(final.parameters.get("corner", 1.0))
     drift = exposure_evidence(tracks.without_vignetting(corner) if VIGNETTING in kept else tracks, frames)
@@ -147,14 +152,8 @@ def explain(tracks: LightTracks, frames: int) -> Light:
         kept=kept,
         before={name: deviations[kept - {name}] for name in (EXPOSURE, VIGNETTING)},
         after={name: deviations[kept | {name}] for name in (EXPOSURE, VIGNETTING)},
-        gain=np.array(drift.parameters.get("gain", np.ones((frames, 3)))),
         corner=corner,
     )
-
-
-def _margin(kept: frozenset[str]) -> float:
-    """By what share the held-out deviation has to fall for all of `kept` to be corrected."""
-    return BOTH if len(kept) > 1 else MARGIN[next(iter(kept))] if kept else 0.0
 
 
 def spread(tracks: LightTracks) -> float:

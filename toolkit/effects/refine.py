@@ -112,7 +112,9 @@ class Placing:
         self.problem, self.given, self.fitted, self.scatter = problem, given, fitted, scatter
         self.depth = max(float(np.median(predict(problem)[0][:, 2])), 1e-9) if len(problem.frame) else 1.0
         self.focal = float(np.median(problem.focal))
-        self.turn, self.move = self._corrections(problem.poses)
+        turned = np.einsum("fij,fkj->fik", problem.poses[:, :3, :3], given[:, :3, :3])
+        self.turn = Rotation.from_matrix(turned).as_rotvec()  # (F, 3) of the cameras, world axes
+        self.move = problem.poses[:, :3, 3] - given[:, :3, 3]  # (F, 3)
         own = np.flatnonzero(fitted)
         apart = [self._apart(int(frame), problem.poses[frame], *self._expected(int(frame))) for frame in own] if len(own) > 1 else [0.0]
         self.most = max(FACTOR * float(np.median(apart)), FLOOR)
@@ -142,11 +144,6 @@ class Placing:
     def _explains(self, off: Array) -> bool:
         inliers = off < CLOSE * max(self.scatter, 0.15)
         return bool(inliers.sum() >= FEWEST and inliers.mean() >= INLIERS)
-
-    def _corrections(self, poses: Array) -> tuple[Array, Array]:
-        """(F, 3) turns and (F, 3) moves of the cameras, world axes."""
-        turned = np.einsum("fij,fkj->fik", poses[:, :3, :3], self.given[:, :3, :3])
-        return Rotation.from_matrix(turned).as_rotvec(), poses[:, :3, 3] - self.given[:, :3, 3]
 
     def _expected(self, frame: int) -> tuple[Array, Array]:
         """The turn and the move that the nearest other fitted cameras have, by their distance."""
@@ -179,7 +176,7 @@ def believed(problem: Problem, before: float, left: float) -> Belief:
     """The problem's poses, taken to be off by as much as its points show: each by a turn, and by a move at the points' distance, that shift
     what is seen by `before` working pixels.
 
-    What fits leave, `left` working pixels, hardly tells a slow turn along a walk from a slow move, nor the scale; where a lens
+    What fits leave, `left` working pixels, hardly separates a slow turn along a walk from a slow move, nor the scale; where a lens
     is not quite as it is taken to be, all depths drift by some percent. What images do show outweighs this by far.
     """
     focal, depth = float(np.median(problem.focal)), float(np.median(predict(problem)[0][:, 2]))

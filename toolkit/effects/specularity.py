@@ -19,7 +19,7 @@ import numpy as np
 
 from fieldfuse.camera import Array
 from fieldfuse.effects.adjust import Problem
-from fieldfuse.effects.evidence import Evidence, HeldOut, median_of_finite
+from fieldfuse.effects.evidence import Finding, median_of_finite
 from fieldfuse.effects.far_background import AROUND, BLUR, CELL, CROSS, HALF, carried, rays_of
 from fieldfuse.effects.light import VIGNETTING, Light
 from fieldfuse.effects.tracks import Tracks
@@ -59,7 +59,7 @@ class _Image:
         return cls(log.astype(np.float32), usable & (cv2.dilate(grey, square) < CLIPPED) if found.kept else usable)
 
 
-def find_specularity(seen: Tracks, problem: Problem, depth: Array, found: Light) -> HeldOut:
+def find_specularity(seen: Tracks, problem: Problem, depth: Array, found: Light) -> Finding:
     """Look at patches of some images in others.
 
     Args:
@@ -80,11 +80,12 @@ def find_specularity(seen: Tracks, problem: Problem, depth: Array, found: Light)
     part = hits / total if total >= FEWEST and hits >= MIN_SHINY else 0.0
     errors = errors[np.isfinite(errors).all(1)]
     before, after = (float(value) for value in np.median(errors, axis=0)) if len(errors) else (None, None)
+    there = part > THRESHOLD and before is not None and after is not None and after < (1 - GAIN) * before
     reason = (
         f"{100 * part:.2f}% of the patches lie in areas that one picture shows more than {BRIGHTER:g} stops brighter than others show the "
         f"same surface; {100 * THRESHOLD:.2f}% or more speak for highlights or reflections"
     )
-    return HeldOut(Evidence("view_dependence", part, THRESHOLD, reason), GAIN, before, after)
+    return Finding("view_dependence", part, THRESHOLD, reason, there, before, after, "stops")
 
 
 def _excess(seen: Tracks, problem: Problem, depth: Array, images: list[_Image], one: int) -> Array | None:

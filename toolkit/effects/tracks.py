@@ -17,7 +17,7 @@ from fieldfuse.camera import Array, Intrinsics
 from fieldfuse.capture.images import load_image, load_mask, turns_by_exif
 from fieldfuse.capture.types import Capture, Frame
 from fieldfuse.effects.light import LightTracks
-from fieldfuse.poses.points import find_tracks, neighbour_pairs, root_sift, undistorted
+from fieldfuse.poses.points import detect_sift, find_tracks, neighbour_pairs, undistorted
 from fieldfuse.progress import SILENT, Progress
 from fieldfuse.tone import LINEAR
 
@@ -180,26 +180,23 @@ def _look(image: Array, mask: Array | None, camera: Intrinsics, effort: Effort) 
     if scale < 1:
         small = np.asarray(cv2.resize(small, (round(width * scale), round(height * scale)), interpolation=cv2.INTER_AREA))
     grey = cv2.cvtColor(small, cv2.COLOR_RGB2GRAY)
-    keypoints, descriptors = cv2.SIFT.create(nfeatures=effort.features, contrastThreshold=0.012).detectAndCompute(grey, None)
-    if descriptors is None or len(keypoints) == 0:
-        nothing = np.zeros((0, 128), np.float32)
-        return Look(np.zeros((0, 2)), nothing, np.zeros((0, 3)), np.zeros(0), scale * width / camera.width, grey)
-    at = np.array([k.pt for k in keypoints], dtype=np.float32)  # whole-number pixel centres
-    size = 0.5 * np.array([k.size for k in keypoints], dtype=np.float32)
+    at, size, descriptors = detect_sift(grey, effort.features, 0.012)
     log = np.log2(np.maximum(LINEAR[grey], LINEAR[8]))
     gx, gy = cv2.Sobel(log, cv2.CV_32F, 1, 0, scale=0.125), cv2.Sobel(log, cv2.CV_32F, 0, 1, scale=0.125)
-    slopes = cv2.GaussianBlur(np.stack([gx * gx, gy * gy], axis=2), (0, 0), WINDOW)
+    slopes = cv2.GaussianBlur(np.stack([gx * gx, gx * gy, gy * gy], axis=2), (0, 0), WINDOW)  # of two channels OpenCV samples coarsely
     keep = np.ones(len(at), dtype=bool)
     for shown in (image[..., 3] if image.shape[2] == 4 else None, None if mask is None else mask.astype(np.uint8) * 255):
         if shown is not None:
             solid = cv2.resize(shown, (small.shape[1], small.shape[0]), interpolation=cv2.INTER_AREA) >= 250
             keep &= solid[np.clip(np.rint(at[:, 1]).astype(int), 0, None), np.clip(np.rint(at[:, 0]).astype(int), 0, None)]
-    slope = cv2.remap(slopes, at[None, :, 0], at[None, :, 1], cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)[0]
+    if len(at):
+        slopes = cv2.remap(slopes, at[None, :, 0], at[None, :, 1], cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
+    slope = slopes.reshape(-1, 3)[: len(at)]
     return Look(
         pixel=((at.astype(np.float64) + 0.5) * [camera.width / small.shape[1], camera.height / small.shape[0]])[keep],
-        descriptor=root_sift(descriptors)[keep],
-        linear=_around(LINEAR[small], at[keep], size[keep]),
-        slope=slope[keep].astype(np.float64).sum(1),
+        descriptor=descriptors[keep],
+        linear=_around(LINEAR[small], at[keep], 0.5 * size[keep]),
+        slope=slope[keep].astype(np.float64)[:, ::2].sum(1),
         scale=scale * width / camera.width,
         grey=grey,
     )

@@ -4,7 +4,7 @@ Measured is the share of matches that agree with the epipolar geometry of the gi
 these (`two_view`). Right poses reach 0.7 to 1 where wrong ones mostly stay below 0.5. Where the share is low, other readings of the poses
 are tried (`mistakes`): one that clearly fits, on pairs that had no part in choosing it too, is used. Poses that no reading saves are
 refused if the evidence is strong: many pairs with parallax, most of which contradict even the rough motion. Noisy poses pass.
-Single cameras that all of their matches contradict are left out.
+Single cameras that all of their matches contradict are excluded.
 """
 
 from __future__ import annotations
@@ -38,11 +38,11 @@ PLATEAU = 0.01  # of the score within which focal lengths fit alike
 ROUGH = 0.4  # of the pairs with parallax: fewer that agree roughly with the poses contradict them (noise of 3° leaves 0.7)
 EXACT = 0.8  # median of the pairs' shares from which what is only nearly right stands out as wrong
 FEW_PAIRS = 6  # pairs with parallax that a refusal needs
-LEAST_MATCHES = 100  # below which nothing is said
+LEAST_MATCHES = 100  # below which nothing is concluded
 WRONG, RIGHT = 0.3, 0.5  # share of a pair's matches that agree: below, the pair contradicts its poses; above, it confirms them
-MOST_WRONG = 0.2  # share of the cameras that may be left out
+MOST_WRONG = 0.2  # share of the cameras that may be excluded
 OUTLYING = 20.0  # times the median distance of cameras from their middle
-LOST = 100.0  # the same, of cameras that are left out if no match confirms them
+LOST = 100.0  # the same, of cameras that are excluded if no match confirms them
 SUSPECTS = 8  # images that are looked at because their poses are odd
 SAME_TURN, SAME_WAY = 1.0, 5.0  # degrees within which two readings are one geometry
 
@@ -66,10 +66,10 @@ def check_given(
     progress: Progress = SILENT,
     known: dict[str, Features] | None = None,
 ) -> PoseResult:
-    """The poses as they fit the images, with warnings of what was changed or left out; `agreement` says how well they fit.
+    """The poses as they fit the images, with warnings of what was changed or excluded; `agreement` is how well they fit.
 
     Args:
-        convention: `as_is` keeps the poses whatever is found; it is still said.
+        convention: `as_is` keeps the poses whatever is found; the warning stays.
         known: features by name; those found are added.
 
     Raises:
@@ -96,11 +96,10 @@ def check_given(
     if reading is not None:
         if keep_all:
             text = f"{_low(agreement)} of {_what(capture)}, and more would {reading.text}; they are kept as they came"
-            return _told(replace(given, warnings=[*given.warnings, text]), agreement)
+            return _told(given.warned(text), agreement)
         before, matches = agreement, _seen_by(reading, matches, posed, chosen)
         agreement = _agreement(reading.poses[chosen], matches)
-        checked = _read_so(given, reading)
-        checked.warnings.append(
+        checked = _read_so(given, reading).warned(
             f"the poses of {_what(capture)} do not fit its images as they came ({before.share:.0%} of {before.matches:,} matches agree); "
             f"they fit {reading.text} ({agreement.share:.0%} agree), and are used so; --set poses.convention=as_is keeps them as they came"
         )
@@ -124,15 +123,11 @@ def best_fitting(captures: Sequence[Capture], progress: Progress = SILENT) -> in
     """Of several captures with the same images and poses from different sources, the one whose poses fit best; of equals the first."""
     scores = []
     for capture in captures:
-        known: dict[str, Features] = {}
         posed = [i for i, frame in enumerate(capture.frames) if frame.world_from_camera is not None and frame.intrinsics is not None]
         poses = np.array([capture.frames[i].world_from_camera for i in posed], dtype=np.float64).reshape(-1, 4, 4)
-        if len(poses) < 2:
-            scores.append(0.0)
-            continue
-        chosen = choose_images(poses, same_poses(poses))
-        matches = find_matches(capture, [posed[i] for i in chosen], progress=progress, known=known)
-        scores.append(float(_score(poses[chosen], matches)) if len(matches.pair) >= LEAST_MATCHES else 0.0)
+        chosen = choose_images(poses, same_poses(poses)) if len(poses) > 1 else []
+        matches = find_matches(capture, [posed[i] for i in chosen], progress=progress)
+        scores.append(_score(poses[chosen], matches) if len(matches.pair) >= LEAST_MATCHES else 0.0)
     return int(np.argmax(scores))
 
 
@@ -165,12 +160,9 @@ def choose_images(poses: Array, twins: Array) -> list[int]:
 
 
 def _links(chosen: list[int], twins: Array) -> list[tuple[int, int]]:
-    """Pairs of cameras that are said to have one pose."""
-    groups: dict[int, list[int]] = {}
-    for position, index in enumerate(chosen):
-        if twins[index] >= 0:
-            groups.setdefault(int(twins[index]), []).append(position)
-    return [(group[0], other) for group in groups.values() for other in group[1 : 1 + SUSPECTS]]
+    """Pairs of cameras to which the capture gives one pose."""
+    groups = [[position for position, index in enumerate(chosen) if twins[index] == group] for group in np.unique(twins[twins >= 0])]
+    return [(group[0], other) for group in groups for other in group[1 : 1 + SUSPECTS]]
 
 
 def _distances(centres: Array) -> Array:
@@ -205,10 +197,8 @@ def _seen_by(reading: Reading, matches: Matches, posed: Capture, chosen: Sequenc
 def _other_reading(
     posed: Capture, poses: Array, chosen: list[int], matches: Matches, lens_alone: bool = False
 ) -> tuple[Reading | None, Reading | None]:
-    """The reading of the poses that clearly fits, if one does; and the best guess, if there is one.
-
-    With `lens_alone` only other focal lengths are tried. Where there is depth, they are not: it may be of the same camera.
-    """
+    """The reading of the poses that clearly fits, if one does; and the best guess, if there is one. With `lens_alone` only other focal
+    lengths are tried. Where there is depth, they are not: it may be of the same camera."""
     first = np.arange(len(matches.pairs)) % 2 == 0
     choosing, proving = matches.subset(first), matches.subset(~first)
     if len(proving.pair) == 0:
@@ -254,13 +244,7 @@ def _read_so(given: PoseResult, reading: Reading) -> PoseResult:
         camera = replace(camera, fx=camera.fx * reading.focal, fy=camera.fy * reading.focal)
         return replace(camera, cx=camera.width / 2, cy=camera.height / 2) if reading.centred else camera
 
-    return replace(
-        given,
-        intrinsics=[lens(camera) for camera in given.intrinsics],
-        world_from_camera=reading.poses,
-        points=None,
-        warnings=list(given.warnings),
-    )
+    return replace(given, intrinsics=[lens(camera) for camera in given.intrinsics], world_from_camera=reading.poses, points=None)
 
 
 def _doubt(
@@ -281,8 +265,7 @@ def _doubt(
     noisy = len(rough) >= FEW_PAIRS and rough.mean() > 1 - ROUGH
     inexact = "are inexact, and refined as far as the images allow" if noisy else "may be inexact or wrong"
     what = "are kept as they came" if strong else inexact
-    text = f"{_low(agreement)} of {_what(capture)}{other}: they {what}; --poses sfm finds own ones"
-    return replace(given, warnings=[*given.warnings, text])
+    return given.warned(f"{_low(agreement)} of {_what(capture)}{other}: they {what}; --poses sfm finds own ones")
 
 
 def _low(agreement: Agreement) -> str:
@@ -311,7 +294,7 @@ def _contradicted(poses: Array, matches: Matches) -> list[int]:
     off = deviation(poses, matches)
     share, near = matches.by_pair(off < 1), matches.by_pair(off < NEAR)
     one = np.abs(poses[matches.pairs[:, 0]] - poses[matches.pairs[:, 1]]).max(axis=(1, 2)) < 1e-9
-    # Two images with one pose are the same image, or one of the poses is wrong; that a third is right nobody can tell from them.
+    # Two images with one pose are the same image, or one of the poses is wrong; whether a third is right does not follow from them.
     within = share if np.median(share) >= EXACT else near
     against = np.where(one, share < RIGHT, within < WRONG)
     confirms = (within >= RIGHT) & ~one
@@ -351,7 +334,7 @@ def _leave_out(given: PoseResult, wrong: list[int], twins: set[int], keep_all: b
         return given, []
     if len([i for i in wrong if i not in twins]) > MOST_WRONG * count or keep_all:
         text = f"the images contradict the poses of {len(wrong)} of {count} frames, which are kept"
-        return replace(given, warnings=[*given.warnings, f"{text}: {listed([given.names[i] for i in wrong])}"]), []
+        return given.warned(f"{text}: {listed([given.names[i] for i in wrong])}"), []
     keep = [i for i in range(count) if i not in set(wrong)]
     names = [given.names[i] for i in wrong]
     same = sum(i in twins for i in wrong)
@@ -365,5 +348,4 @@ def _leave_out(given: PoseResult, wrong: list[int], twins: set[int], keep_all: b
         world_from_camera=given.world_from_camera[keep],
         models=[len(keep)],
         missing=[*given.missing, *names],
-        warnings=[*given.warnings, text],
-    ), wrong
+    ).warned(text), wrong

@@ -1,12 +1,13 @@
-"""A child process that may abort, hang or outlive us: started, listened to, and always cleaned up.
+"""A child process that may abort, hang or outlive us: started, listened to, and always cleaned up; both sides of it.
 
 The child speaks JSON lines on its standard output; everything else that it (or a C++ library in it) writes goes to a log
-file. Its standard input is a pipe that we hold open: when it closes, the child knows that we are gone.
+file. Its standard input is a pipe that we hold open: when it closes, the child ends.
 """
 
 from __future__ import annotations
 
 import contextlib
+import ctypes
 import json
 import math
 import os
@@ -23,7 +24,8 @@ from typing import IO, Any
 from fieldfuse.errors import PoseError
 from fieldfuse.progress import SILENT, Progress
 
-TICK = 0.2  # seconds between looks at the user's wish to stop
+PR_SET_PDEATHSIG = 1
+TICK = 0.2  # seconds between looks at whether the user stopped the run
 SILENCE = 1800.0  # seconds without a word from the child after which it counts as hung
 LOG_TAIL = 200  # lines of the log that are looked at for the reason of a crash
 
@@ -45,14 +47,7 @@ def run_child(
     """
     log.parent.mkdir(parents=True, exist_ok=True)
     with log.open("ab") as log_file:
-        process = subprocess.Popen(
-            [sys.executable, "-m", module, *arguments],
-            stdin=subprocess.PIPE,
-            stdout=subprocess.PIPE,
-            stderr=log_file,
-            env={**os.environ, **import_path(), **(environment or {})},
-            start_new_session=True,  # so that Ctrl-C reaches us first and we decide what the child does
-        )
+        process = _start(["-m", module, *arguments], subprocess.PIPE, log_file, {**import_path(), **(environment or {})})
     try:
         _listen(process, log, on_message, progress, silence)
     finally:
@@ -75,15 +70,8 @@ def run_logged(
     Raises:
         TimeoutError: it was ended after `longest` seconds.
     """
-    with log.open("wb") as said:
-        process = subprocess.Popen(
-            [sys.executable, *arguments],
-            stdin=subprocess.PIPE,  # the child ends when it closes
-            stdout=said,
-            stderr=said,
-            env={**os.environ, **(environment or {})},
-            start_new_session=True,  # so that Ctrl-C reaches us first
-        )
+    with log.open("wb") as written:
+        process = _start(arguments, written, written, environment or {})
     start = time.monotonic()
     try:
         while process.poll() is None:
@@ -95,6 +83,13 @@ def run_logged(
     finally:
         end(process)
     return int(process.returncode)
+
+
+def _start(arguments: list[str], out: int | IO[bytes], errors: IO[bytes], environment: dict[str, str]) -> subprocess.Popen[bytes]:
+    """Python with `arguments`. Its standard input is a pipe: the child ends when it closes."""
+    command, env = [sys.executable, *arguments], {**os.environ, **environment}
+    # In a session of its own Ctrl-C reaches us first, and we decide what the child does.
+    return subprocess.Popen(command, stdin=subprocess.PIPE, stdout=out, stderr=errors, env=env, start_new_session=True)
 
 
 def end(process: subprocess.Popen[bytes]) -> None:
@@ -115,8 +110,8 @@ def log_tail(log: Path) -> str:
         lines = [line.strip() for line in log.read_text(encoding="utf-8", errors="replace").splitlines()[-LOG_TAIL:] if line.strip()]
     except OSError:
         lines = []
-    telling = [line for line in lines if not line.startswith(("@", "***", "PC:"))] or lines
-    return telling[-1][-300:] if telling else "(empty)"
+    reasons = [line for line in lines if not line.startswith(("@", "***", "PC:"))] or lines
+    return reasons[-1][-300:] if reasons else "(empty)"
 
 
 def import_path() -> dict[str, str]:
@@ -142,25 +137,26 @@ def _listen(
     process: subprocess.Popen[bytes], log: Path, on_message: Callable[[dict[str, Any]], None], progress: Progress, silence: float
 ) -> None:
     lines: queue.Queue[bytes | None] = queue.Queue()
+    assert process.stdout is not None
+    out = process.stdout
 
-    def pump(stream: IO[bytes]) -> None:
+    def pump() -> None:
         with contextlib.suppress(OSError, ValueError):
-            for line in stream:
+            for line in out:
                 lines.put(line)
         lines.put(None)
 
-    assert process.stdout is not None
-    threading.Thread(target=pump, args=(process.stdout,), daemon=True).start()
-    heard = time.monotonic()
+    threading.Thread(target=pump, daemon=True).start()
+    last = time.monotonic()
     while True:
         progress.check()
         try:
             line = lines.get(timeout=TICK)
         except queue.Empty:
-            if time.monotonic() - heard > silence:
+            if time.monotonic() - last > silence:
                 raise PoseError(f"the process that finds poses said nothing for {silence:.0f} seconds and was ended; see {log}") from None
             continue
-        heard = time.monotonic()
+        last = time.monotonic()
         if line is None:
             with contextlib.suppress(subprocess.TimeoutExpired):
                 process.wait(timeout=30)
@@ -169,3 +165,34 @@ def _listen(
             message = json.loads(line)
             if isinstance(message, dict):
                 on_message(message)
+
+
+# ------------------------------------------------------------------------------------------------- in the child
+
+
+def die_with_parent() -> None:
+    """Never outlive the parent: the kernel's signal on Linux, the end of standard input elsewhere and for good measure."""
+    if sys.platform == "linux":
+        ctypes.CDLL(None, use_errno=True).prctl(PR_SET_PDEATHSIG, signal.SIGKILL, 0, 0, 0)
+
+    def watch() -> None:
+        while os.read(0, 1):  # not sys.stdin: its lock, held here, aborts the interpreter when it ends
+            pass
+        os._exit(3)
+
+    threading.Thread(target=watch, daemon=True).start()
+
+
+class Messages:
+    """To the parent. The real standard output is held here; file descriptor 1 then leads to the log, whatever C++ prints."""
+
+    def __init__(self) -> None:
+        self.pipe: IO[str] = os.fdopen(os.dup(1), "w", buffering=1, encoding="utf-8")
+        os.dup2(2, 1)
+
+    def send(self, **message: Any) -> None:
+        try:
+            self.pipe.write(json.dumps(message) + "\n")
+            self.pipe.flush()
+        except OSError:
+            os._exit(3)  # nobody listens any more

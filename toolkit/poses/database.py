@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator
 from concurrent.futures import Future, ThreadPoolExecutor
+from contextlib import contextmanager
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -14,13 +15,15 @@ import pycolmap
 
 from fieldfuse.camera import Array
 from fieldfuse.capture.images import load_image, usable_pixels
+from fieldfuse.capture.types import Frame
 from fieldfuse.errors import InputError
 from fieldfuse.files import read_json, remove, write_json
-from fieldfuse.poses.features import floats, learned, sift
-from fieldfuse.poses.job import SIFT, TOLERANCE, Job, Picture
+from fieldfuse.poses.job import SIFT, TOLERANCE, Job
 from fieldfuse.poses.pairs import coarse
+from fieldfuse.poses.points import at_pixels
 
-THUMBNAIL = 32  # pixels a side of the picture kept to tell identical ones
+CONTRAST = 0.014  # finds as many as COLMAP's own detector does with its threshold
+THUMBNAIL = 32  # pixels a side of the image, by which identical ones are found
 GUESSED_FOCAL = 1.2  # of the long side, when nothing is known
 MIN_INLIERS = 15  # COLMAP's own bound for a verified pair
 ENLARGED = 2.0  # times at most that an image is enlarged for learned features, which are found to a pixel: SIFT does so by itself
@@ -32,6 +35,21 @@ LEAST_MOVING = 12  # matches that move, and that one epipolar geometry must expl
 STRAIGHT = 0.75  # share of them that go away from one point where the camera did not turn
 
 Report = Callable[[float, float, str], None]
+
+
+@contextmanager
+def opened(path: Path) -> Iterator[pycolmap.Database]:
+    """The database at `path`, closed afterwards."""
+    database = pycolmap.Database.open(path)
+    try:
+        yield database
+    finally:
+        database.close()
+
+
+def keypoints_of(database: pycolmap.Database) -> dict[int, Array]:
+    """(N, 4) of every image by its id in the database: x, y, scale, angle."""
+    return {image.image_id: np.asarray(database.read_keypoints(image.image_id)).reshape(-1, 4) for image in database.read_all_images()}
 
 
 def open_database(job: Job) -> pycolmap.Database:
@@ -61,40 +79,72 @@ def _discard(job: Job) -> None:
 # ------------------------------------------------------------------------------------------------- features
 
 
-def extract(job: Job, database: pycolmap.Database, report: Report) -> list[dict[str, Any]]:
-    """Features of every picture into the database; what is there already is kept.
+def sift(grey: Array, most: int) -> tuple[Array, Array]:
+    """The `most` largest features of (H, W) uint8, always the same ones: these are found again from other places.
 
     Returns:
-        a record a picture: name, width, height, keypoints, deviation (of grey values), thumbnail.
+        (N, 4) float32 keypoints: x and y in pixels, pixel centres at +0.5, scale in pixels, angle in radians; (N, 128) uint8 descriptors,
+        512 times the root of their shares (root-SIFT; Arandjelović and Zisserman, CVPR 2012).
+    """
+    # Without `enable_precise_upscale` all keypoints lie a quarter of a pixel off, right and below.
+    finder = cv2.SIFT.create(contrastThreshold=CONTRAST, enable_precise_upscale=True)
+    found, described = finder.detectAndCompute(np.ascontiguousarray(grey), None)
+    if described is None or len(found) == 0:
+        return np.zeros((0, 4), np.float32), np.zeros((0, 128), np.uint8)
+    largest = np.argsort([-point.size for point in found], kind="stable")[:most]
+    found, described = [found[i] for i in largest], described[largest]
+    keypoints = np.array([(*point.pt, point.size / 2, np.deg2rad(point.angle)) for point in found], dtype=np.float32)
+    keypoints[:, :2] += 0.5
+    shares = described / np.maximum(described.sum(axis=1, keepdims=True), 1e-9)
+    return keypoints, np.minimum(np.round(512 * np.sqrt(shares)), 255).astype(np.uint8)
+
+
+def learned(grey: Array, most: int) -> tuple[Array, Array]:
+    """As `sift`, by XFeat: the surest first; (N, 128) uint8 are the bytes of (N, 64) float16."""
+    from fieldfuse.poses import xfeat  # torch takes a second and 200 MB, and is not always needed
+
+    network = xfeat.installed()
+    assert network is not None  # a job with these features is made only where the weights are
+    keypoints, descriptors = xfeat.detect(network, grey, most)
+    return keypoints, descriptors.astype(np.float16).view(np.uint8)
+
+
+def floats(descriptors: Array, features: str) -> Array:
+    """(N, 128) uint8 from the database → (N, 128) or (N, 64) float32."""
+    rows = np.ascontiguousarray(descriptors, dtype=np.uint8).reshape(-1, 128)
+    return (rows if features == SIFT else rows.view(np.float16)).astype(np.float32)
+
+
+def extract(job: Job, database: pycolmap.Database, report: Report) -> list[dict[str, Any]]:
+    """Features of every image into the database, those that are not there yet.
+
+    Returns:
+        a record an image: name, width, height, keypoints, deviation (of grey values), thumbnail.
     """
     records: dict[str, dict[str, Any]] = {}
     if job.records.exists():
         records = {record["name"]: record for record in read_json(job.records)}
-    todo = [i for i, picture in enumerate(job.pictures) if picture.name not in records or not database.exists_image(label(i))]
-    done = len(job.pictures) - len(todo)
-    report(done, len(job.pictures), f"features {done} of {len(job.pictures)}")
+    todo = [i for i, image in enumerate(job.images) if image.name not in records or not database.exists_image(label(i))]
+    done = len(job.images) - len(todo)
+    report(done, len(job.images), f"features {done} of {len(job.images)}")
     for index, (record, keypoints, descriptors) in _features(job, todo):
         if not database.exists_image(label(index)):
             with pycolmap.DatabaseTransaction(database):
-                _write_picture(job, database, index, record, keypoints, descriptors)
+                _write_image(job, database, index, record, keypoints, descriptors)
         records[record["name"]] = record
         done += 1
-        if done % 10 == 0 or done == len(job.pictures):
+        if done % 10 == 0 or done == len(job.images):
             write_json(job.records, list(records.values()))
-        report(done, len(job.pictures), f"features {done} of {len(job.pictures)}")
-    return [records[picture.name] for picture in job.pictures]
+        report(done, len(job.images), f"features {done} of {len(job.images)}")
+    return [records[image.name] for image in job.images]
 
 
 def _features(job: Job, indices: list[int]) -> Iterator[tuple[int, tuple[dict[str, Any], Array, Array]]]:
-    """Features of the pictures at `indices`, a few ahead of what is asked for, in order."""
-
-    def work(index: int) -> tuple[dict[str, Any], Array, Array]:
-        return _describe(job.pictures[index], job)
-
+    """Features of the images at `indices`, a few ahead, in order."""
     with ThreadPoolExecutor(job.threads) as pool:
         ahead: list[tuple[int, Future[tuple[dict[str, Any], Array, Array]]]] = []
         for index in indices:
-            ahead.append((index, pool.submit(work, index)))
+            ahead.append((index, pool.submit(_describe, job.images[index], job)))
             if len(ahead) > 2 * job.threads:
                 first, future = ahead.pop(0)
                 yield first, future.result()
@@ -102,9 +152,8 @@ def _features(job: Job, indices: list[int]) -> Iterator[tuple[int, tuple[dict[st
             yield first, future.result()
 
 
-def _describe(picture: Picture, job: Job) -> tuple[dict[str, Any], Array, Array]:
-    """One picture as every later stage loads it, its keypoints (N, 4) in its own pixels and descriptors (N, 128) for the database."""
-    frame = picture.frame()
+def _describe(frame: Frame, job: Job) -> tuple[dict[str, Any], Array, Array]:
+    """One image as every later stage loads it, its keypoints (N, 4) in its own pixels and descriptors (N, 128) for the database."""
     pixels = load_image(frame, exif=job.exif)
     height, width = pixels.shape[:2]
     grey = cv2.cvtColor(np.ascontiguousarray(pixels[..., :3]), cv2.COLOR_RGB2GRAY)
@@ -115,13 +164,11 @@ def _describe(picture: Picture, job: Job) -> tuple[dict[str, Any], Array, Array]
     keypoints, descriptors = sift(seen, job.max_features) if job.features == SIFT else learned(seen, job.max_features)
     keypoints = keypoints * np.array([width / size[0], height / size[1], width / size[0], 1.0], dtype=np.float32)
     if usable is not None and len(keypoints):
-        column = np.clip(keypoints[:, 0].astype(int), 0, width - 1)
-        row = np.clip(keypoints[:, 1].astype(int), 0, height - 1)
-        keep = usable[row, column]
+        keep = at_pixels(usable, keypoints[:, :2])
         keypoints, descriptors = keypoints[keep], descriptors[keep]
     thumbnail = cv2.resize(grey, (THUMBNAIL, THUMBNAIL), interpolation=cv2.INTER_AREA)
     record = {
-        "name": picture.name,
+        "name": frame.name,
         "width": width,
         "height": height,
         "keypoints": len(keypoints),
@@ -144,12 +191,12 @@ def tolerant(job: Job, records: list[dict[str, Any]]) -> Job:
 
 
 def label(index: int) -> str:
-    """The name of a picture inside the database: COLMAP's lists of pairs cannot hold names with spaces."""
+    """The name of an image inside the database: COLMAP's lists of pairs cannot hold names with spaces."""
     return f"{index:06d}"
 
 
-def _write_picture(job: Job, database: pycolmap.Database, index: int, record: dict[str, Any], keypoints: Array, descriptors: Array) -> None:
-    camera_id, rig_id = _camera(job, database, job.pictures[index], record["width"], record["height"])
+def _write_image(job: Job, database: pycolmap.Database, index: int, record: dict[str, Any], keypoints: Array, descriptors: Array) -> None:
+    camera_id, rig_id = _camera(job, database, job.images[index], record["width"], record["height"])
     image = pycolmap.Image(name=label(index), camera_id=camera_id)
     image_id = database.write_image(image)
     frame = pycolmap.Frame()
@@ -163,22 +210,22 @@ def _write_picture(job: Job, database: pycolmap.Database, index: int, record: di
     database.write_descriptors(image_id, data)
 
 
-def lens_model(pictures: int) -> str:
-    """Fewer parameters for fewer pictures: what a handful of views cannot tell apart is left out."""
-    return "OPENCV" if pictures >= 30 else "SIMPLE_RADIAL"
+def lens_model(images: int) -> str:
+    """Fewer parameters for fewer images: those that a handful of views cannot separate are not there."""
+    return "OPENCV" if images >= 30 else "SIMPLE_RADIAL"
 
 
-def _camera(job: Job, database: pycolmap.Database, picture: Picture, width: int, height: int) -> tuple[int, int]:
-    """The (camera, rig) ids for a picture: shared by pictures of one size when the job says that there is one camera."""
-    focal = picture.focal_prior or GUESSED_FOCAL * max(width, height)
+def _camera(job: Job, database: pycolmap.Database, frame: Frame, width: int, height: int) -> tuple[int, int]:
+    """The (camera, rig) ids for an image: shared by images of one size when the job has one camera."""
+    focal = frame.focal_prior or GUESSED_FOCAL * max(width, height)
     if job.one_camera:
         for rig in database.read_all_rigs():
             camera = database.read_camera(rig.ref_sensor_id.id)
             if (camera.width, camera.height) == (width, height):
                 return camera.camera_id, rig.rig_id
-    model = lens_model(len(job.pictures)) if job.one_camera else "SIMPLE_RADIAL"
+    model = lens_model(len(job.images)) if job.one_camera else "SIMPLE_RADIAL"
     camera = pycolmap.Camera.create_from_model_name(0, model, focal, width, height)
-    camera.has_prior_focal_length = picture.focal_prior is not None
+    camera.has_prior_focal_length = frame.focal_prior is not None
     camera.camera_id = database.write_camera(camera)
     rig = pycolmap.Rig()
     rig.add_ref_sensor(camera.sensor_id)
@@ -189,33 +236,33 @@ def _camera(job: Job, database: pycolmap.Database, picture: Picture, width: int,
 
 
 def sketches(job: Job, database: pycolmap.Database) -> list[Array]:
-    """The coarsest descriptors of every picture, for choosing pairs."""
+    """The coarsest descriptors of every image, for choosing pairs."""
     out = []
-    for index in range(len(job.pictures)):
+    for index in range(len(job.images)):
         image_id = database.read_image_with_name(label(index)).image_id
         keypoints = np.asarray(database.read_keypoints(image_id)).reshape(-1, 4)
         out.append(coarse(floats(database.read_descriptors(image_id).data, job.features), keypoints[:, 2]))
     return out
 
 
-def pair_facts(job: Job, database: pycolmap.Database) -> list[dict[str, Any]]:
+def pair_facts(database: pycolmap.Database) -> list[dict[str, Any]]:
     """Each verified pair: indices, matches, inliers, whether a homography explains it (with it), how far features moved, and what stands
     still beside what moves (`stands`)."""
     index = {image.image_id: int(image.name) for image in database.read_all_images()}
-    keypoints = {image_id: np.asarray(database.read_keypoints(image_id)).reshape(-1, 4) for image_id in index}
+    keypoints = keypoints_of(database)
     configurations = pycolmap.TwoViewGeometryConfiguration
     flat = (configurations.PLANAR, configurations.PANORAMIC, configurations.PLANAR_OR_PANORAMIC)
     matched = dict(zip(*database.read_all_matches(), strict=True))
     facts = []
-    ids, geometries = database.read_two_view_geometries()
-    for pair_id, geometry in zip(ids, geometries, strict=True):
+    for pair_id, geometry in zip(*database.read_two_view_geometries(), strict=True):
         inliers = np.asarray(geometry.inlier_matches).reshape(-1, 2)
         if len(inliers) < MIN_INLIERS:
             continue
         first, second = pycolmap.pair_id_to_image_pair(pair_id)
-        moved = keypoints[first][inliers[:, 0], :2] - keypoints[second][inliers[:, 1], :2]
+        here, there = keypoints[first][:, :2], keypoints[second][:, :2]
         homography = None if geometry.H is None else np.asarray(geometry.H, dtype=np.float64)
         explained = geometry.config in flat and homography is not None and bool(np.all(np.isfinite(homography)))
+        rows = np.asarray(matched.get(pair_id, np.zeros((0, 2), np.int64))).reshape(-1, 2)
         facts.append(
             {
                 "first": index[first],
@@ -223,31 +270,25 @@ def pair_facts(job: Job, database: pycolmap.Database) -> list[dict[str, Any]]:
                 "inliers": len(inliers),
                 "flat": explained,
                 "homography": homography.tolist() if explained and homography is not None else None,
-                "moved": float(np.median(np.linalg.norm(moved, axis=1))),
-                "stands": stands(*_matched_places(keypoints, first, second, matched.get(pair_id))),
+                "moved": float(np.median(np.linalg.norm(here[inliers[:, 0]] - there[inliers[:, 1]], axis=1))),
+                "stands": stands(here[rows[:, 0]], there[rows[:, 1]]),
             }
         )
     return facts
 
 
-def _matched_places(keypoints: dict[int, Array], first: int, second: int, matches: Array | None) -> tuple[Array, Array]:
-    """(M, 2) pixels of each match in both pictures; of none where a database has none."""
-    rows = np.zeros((0, 2), np.int64) if matches is None else np.asarray(matches).reshape(-1, 2)
-    return keypoints[first][rows[:, 0], :2], keypoints[second][rows[:, 1], :2]
-
-
 def stands(here: Array, there: Array) -> tuple[float, bool] | None:
-    """Whether many features stay where they are in two pictures while others move together; None where nothing of the kind is seen.
+    """Whether many features stay where they are in two images while others move together; None where nothing of the kind is seen.
 
     What is very far away stands still, too, before a camera that moves and does not turn: then all that moves goes away from one point,
     near or infinitely far.
 
     Returns:
-        the share of the picture's area that the standing ones take up, and whether the moving ones go other ways than from one point: then
+        the share of the image's area that the standing ones take up, and whether the moving ones go other ways than from one point: then
         no motion of one camera explains both.
 
     Args:
-        here, there: (M, 2) pixels of matched features in two pictures.
+        here, there: (M, 2) pixels of matched features in two images.
     """
     if len(here) < 2 * LEAST_MOVING:
         return None

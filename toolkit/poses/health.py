@@ -14,26 +14,27 @@ from fieldfuse.camera import Array
 from fieldfuse.poses.job import GLOBAL, LOOSE
 from fieldfuse.poses.result import listed
 
-FEW_KEYPOINTS = 40  # below which a picture cannot be matched reliably
+FEW_KEYPOINTS = 40  # below which an image cannot be matched reliably
 BARE = 0.6  # of the usual number of keypoints, below which missing texture is named as a cause
-SAME = 1.0  # grey levels between thumbnails of pictures that count as identical
-BLACK = 2.0  # grey deviation of a picture without content
+SAME = 1.0  # grey levels between thumbnails of images that count as identical
+BLACK = 2.0  # grey deviation of an image without content
 FLAT_SHARE = 0.8  # of verified pairs explained by a homography before the scene or the motion is called degenerate
 FLAT_SHARE_LOOSE = 0.5  # of verified pairs, the same: enough where COLMAP's own rules have found nothing
 ROTATION_RESIDUAL = 0.06  # distance of K⁻¹HK from a rotation, relative
 STILL = 0.004  # features moved by less than this share of the long side: the camera stood still
 SMALL_ANGLE = 1.5  # degrees; the median triangulation angle below which depth is guesswork
-PRETENDED = 5.0  # times the way that the pairs tell of: a model that moves its cameras so far has a wrong lens (true ones: at most once)
+PRETENDED = 5.0  # times the way by the pairs: a model that moves its cameras so far has a wrong lens (true ones: at most once)
 TOO_FEW = 3  # registered frames that make a model at all
 SHARE_STANDING = 0.1  # of the pairs, in which something stands still while the rest moves
 FEW_STANDING, SHARE_AGAINST = 5, 0.02  # pairs, and their share, in which no camera motion explains both
 MARK = 0.1  # of the image: what stands still on less is an overlay rather than a background
+SIDEWAYS = "move sideways around the scene while recording"
 AGREES = 0.7  # share of a frame's matches that agree with its place where that can be trusted (0.70 at least in right ones, but for one)
 
 
 @dataclass(frozen=True)
 class Motion:
-    """What the verified pairs say about how the camera moved."""
+    """How the camera moved, by the verified pairs."""
 
     flat_share: float  # of pairs that a homography explains
     residual: float  # how far these homographies are from pure rotations at the best focal length
@@ -41,17 +42,15 @@ class Motion:
 
 
 def hopeless(records: Sequence[dict[str, Any]]) -> str | None:
-    """The reason why matching is not worth starting, from the pictures alone; None when it is."""
+    """The reason why matching is not worth starting, from the images alone; None when it is."""
     count = len(records)
     if count < 2:
         return f"there is {count} picture, and poses need at least 3 from different places; add photos that overlap"
-    keypoints = np.array([record["keypoints"] for record in records])
-    rich = int(np.count_nonzero(keypoints >= FEW_KEYPOINTS))
-    if rich < 2:
+    if sum(record["keypoints"] >= FEW_KEYPOINTS for record in records) < 2:
         dark = sum(record["deviation"] < BLACK for record in records)
         cause = f"{dark} of {count} pictures are one flat colour" if dark else "they are blank, blurred or without texture"
         return (
-            f"no features to match: the pictures hold {int(np.median(keypoints))} keypoints each on the median, and {cause}; "
+            f"no features to match: the pictures hold {_usual_keypoints(records)} keypoints each on the median, and {cause}; "
             f"use sharp, lit pictures of a textured scene"
         )
     thumbnails = np.array([record["thumbnail"] for record in records], dtype=np.float64)
@@ -59,6 +58,10 @@ def hopeless(records: Sequence[dict[str, Any]]) -> str | None:
     if len(sizes) == 1 and np.abs(thumbnails - thumbnails[0]).max() < SAME:
         return f"all {count} pictures are identical, so there is nothing to triangulate from; move the camera between pictures"
     return None
+
+
+def _usual_keypoints(records: Sequence[dict[str, Any]]) -> int:
+    return int(np.median([record["keypoints"] for record in records]))
 
 
 def motion(facts: dict[str, Any]) -> Motion | None:
@@ -79,10 +82,8 @@ def motion(facts: dict[str, Any]) -> Motion | None:
 
 
 def rotation_residual(homographies: Array, width: int, height: int) -> float:
-    """How far (N, 3, 3) pixel homographies are from K R K⁻¹ with one focal length for all: the least median over focal lengths.
-
-    A camera that only turns gives 0 whatever it looks at; one that moves before a plane does not.
-    """
+    """How far (N, 3, 3) pixel homographies are from K R K⁻¹ with one focal length for all: the least median over focal lengths. A camera
+    that only turns gives 0 whatever it looks at; one that moves before a plane does not."""
     if len(homographies) == 0:
         return float("inf")
     best = float("inf")
@@ -99,7 +100,7 @@ def rotation_residual(homographies: Array, width: int, height: int) -> float:
 
 
 def turned_only(facts: dict[str, Any], share: float = FLAT_SHARE) -> bool:
-    """True when the verified pairs (at least this share of them) say that the camera turned on the spot."""
+    """True when by the verified pairs (at least this share of them) the camera turned on the spot."""
     seen = motion(facts)
     return seen is not None and seen.flat_share >= share and seen.residual < ROTATION_RESIDUAL
 
@@ -110,27 +111,21 @@ def failure(facts: dict[str, Any]) -> str | None:
     Args:
         facts: what the child process wrote: `pictures`, `pairs`, `attempts`, `model`.
     """
-    reason = hopeless(facts["pictures"])
+    pictures, model, seen = facts["pictures"], facts["model"], motion(facts)
+    reason, count = hopeless(pictures), len(pictures)
     if reason is not None:
         return reason
-    count = len(facts["pictures"])
-    model = facts["model"]
-    found = 0 if model is None else len(model["pictures"])
-    seen = motion(facts)
     if seen is None:
-        keypoints = int(np.median([record["keypoints"] for record in facts["pictures"]]))
         return (
-            f"no two of the {count} pictures share enough features ({keypoints} keypoints each on the median); take pictures "
-            f"that overlap by two thirds"
+            f"no two of the {count} pictures share enough features ({_usual_keypoints(pictures)} keypoints each on the median); "
+            f"take pictures that overlap by two thirds"
         )
+    found = 0 if model is None else len(model["pictures"])
     narrow = model is None or model["angle"] < SMALL_ANGLE
     if seen.moved < STILL and narrow:
-        return (
-            f"the camera hardly moved: features shift by {100 * seen.moved:.2g}% of the picture on the median; move sideways "
-            f"around the scene while recording"
-        )
-    # A turning camera can be fitted by a wrong lens and a shift, some of its pictures the better, so the verdict of the pairs stands
-    # whatever the mapper says.
+        return f"the camera hardly moved: features shift by {100 * seen.moved:.2g}% of the picture on the median; {SIDEWAYS}"
+    # A turning camera can be fitted by a wrong lens and a shift, some of its images the better, so the verdict of the pairs stands
+    # whatever the mapper finds.
     if turned_only(facts) and (
         model is None
         or found < max(TOO_FEW, count / 2)
@@ -138,22 +133,13 @@ def failure(facts: dict[str, Any]) -> str | None:
         or model["attempt"] == GLOBAL
         or way(facts) > PRETENDED * seen.residual
     ):
-        return (
-            "the camera only turned on the spot (rotations explain all matches), so depth cannot be told; move sideways around "
-            "the scene while recording"
-        )
+        return f"the camera only turned on the spot (rotations explain all matches), so depth cannot be told; {SIDEWAYS}"
     if narrow and model is not None:
-        return (
-            f"there is too little parallax: rays meet at {model['angle']:.2g}° on the median; move sideways around the scene "
-            f"while recording"
-        )
+        return f"there is too little parallax: rays meet at {model['angle']:.2g}° on the median; {SIDEWAYS}"
     # Where homographies explain the pairs, looser rules nearly always find something, whatever the camera did.
     loose = model is not None and model["attempt"] in (LOOSE, GLOBAL)
     if loose and turned_only(facts, FLAT_SHARE_LOOSE):
-        return (
-            "the camera turned on the spot for the most part (rotations explain most matches), so depth cannot be told; move sideways "
-            "around the scene while recording"
-        )
+        return f"the camera turned on the spot for the most part (rotations explain most matches), so depth cannot be told; {SIDEWAYS}"
     if found >= TOO_FEW and not (loose and found < count / 2 and seen.flat_share >= FLAT_SHARE):
         return None
     if seen.flat_share >= FLAT_SHARE:
@@ -161,11 +147,11 @@ def failure(facts: dict[str, Any]) -> str | None:
             "all matches lie on one plane or show too little parallax to start from; include things at different depths and "
             "move sideways while recording"
         )
-    parts = components(count, facts["pairs"])
-    if len(parts[0]) < max(TOO_FEW, count // 2):
+    largest = len(components(count, facts["pairs"])[0])
+    if largest < max(TOO_FEW, count // 2):
         return (
-            f"the pictures overlap too little: the largest group that matches holds {len(parts[0])} of {count}; take more "
-            f"pictures in between"
+            f"the pictures overlap too little: the largest group that matches holds {largest} of {count}; "
+            f"take more pictures in between"
         )
     return (
         f"mapping found no consistent geometry from {len(facts['pairs'])} matched pairs of {count} pictures; take sharper "
@@ -174,26 +160,24 @@ def failure(facts: dict[str, Any]) -> str | None:
 
 
 def way(facts: dict[str, Any]) -> float:
-    """How far the model's cameras moved between two pictures that a homography connects, in shares of the scene's depth: the median.
-
-    A homography is off from a rotation by about as much.
-    """
+    """How far the model's cameras moved between two images that a homography connects, in shares of the scene's depth: the median. A
+    homography is off from a rotation by about as much."""
     model = facts["model"]
     poses, points = np.array(model["world_from_camera"], dtype=np.float64), np.array(model["points"], dtype=np.float64).reshape(-1, 3)
-    at = {picture: number for number, picture in enumerate(model["pictures"])}
+    at = {image: number for number, image in enumerate(model["pictures"])}
     ends = [
         (at[pair["first"]], at[pair["second"]]) for pair in facts["pairs"] if pair["flat"] and {pair["first"], pair["second"]} <= set(at)
     ]
     if not ends or not len(points):
         return 0.0
     depth = float(np.median([np.median((points - pose[:3, 3]) @ pose[:3, 2]) for pose in poses]))
-    first, second = (poses[list(side), :3, 3] for side in zip(*ends, strict=True))
+    first, second = np.swapaxes(poses[np.array(ends), :3, 3], 0, 1)
     return float(np.median(np.linalg.norm(first - second, axis=1))) / max(depth, 1e-12)
 
 
-def components(count: int, pairs: Sequence[dict[str, Any]], least: int = 15) -> list[list[int]]:
-    """Groups of pictures connected by verified pairs with `least` inliers or more, largest first."""
-    linked = [(pair["first"], pair["second"]) for pair in pairs if pair["inliers"] >= least]
+def components(count: int, pairs: Sequence[dict[str, Any]]) -> list[list[int]]:
+    """Groups of images connected by verified pairs, largest first."""
+    linked = [(pair["first"], pair["second"]) for pair in pairs]
     graph = coo_array((np.ones(len(linked)), np.array(linked, dtype=np.int64).reshape(-1, 2).T), shape=(count, count))
     number, label = connected_components(graph, directed=False)
     groups = [np.flatnonzero(label == group).tolist() for group in range(number)]
@@ -201,15 +185,14 @@ def components(count: int, pairs: Sequence[dict[str, Any]], least: int = 15) -> 
 
 
 def shortfalls(facts: dict[str, Any]) -> list[str]:
-    """Warnings for a model that does not hold every picture: which are missing and why, grouped by cause."""
+    """Warnings for a model that does not hold every image: which are missing and why, grouped by cause."""
     pictures, model = facts["pictures"], facts["model"]
     count = len(pictures)
     inside = set(model["pictures"])
     missing = [i for i in range(count) if i not in inside]
     if not missing:
         return []
-    links = np.zeros(count, dtype=int)
-    partners = np.zeros(count, dtype=int)
+    links, partners = np.zeros(count, dtype=int), np.zeros(count, dtype=int)
     for pair in facts["pairs"]:
         for here, there in ((pair["first"], pair["second"]), (pair["second"], pair["first"])):
             partners[here] += 1
@@ -238,7 +221,7 @@ def shortfalls(facts: dict[str, Any]) -> list[str]:
 
 
 def doubts(facts: dict[str, Any]) -> list[str]:
-    """A warning of the frames of a few whose place contradicts many of their matches; whoever made the facts says which (`agreement`)."""
+    """A warning of the frames, of a few, whose place contradicts many of their matches (`agreement`)."""
     shares = {int(i): share for i, share in (facts.get("agreement") or {}).items()}
     doubtful = [i for i, share in sorted(shares.items()) if share < AGREES]
     if not doubtful:
@@ -251,11 +234,8 @@ def doubts(facts: dict[str, Any]) -> list[str]:
 
 
 def fold(facts: dict[str, Any], ordered: bool) -> list[str]:
-    """A warning when places that look alike were taken for one (`loops.without_folds`): what was done about it, or that nothing helped.
-
-    Args:
-        ordered: pictures that stand next to each other were taken one after the other. Else what did not help may well be no fold.
-    """
+    """A warning when places that look alike were taken for one (`loops.without_folds`): what was done about it, or, of images `ordered` in
+    time, that nothing helped."""
     folded = facts.get("folded")
     if folded is None:
         return []
@@ -273,10 +253,8 @@ def fold(facts: dict[str, Any], ordered: bool) -> list[str]:
 
 
 def standing(facts: dict[str, Any]) -> list[str]:
-    """A warning where something stands still in the images of many pairs while the rest moves, in some as no camera motion explains.
-
-    In most pairs of a turntable's neighbouring images all moves sideways, as before a camera that does so.
-    """
+    """A warning where something stands still in the images of many pairs while the rest moves, in some as no camera motion explains. (In
+    most pairs of a turntable's neighbouring images all moves sideways, as before a camera that does so.)"""
     pairs = facts["pairs"]
     extents = [pair["stands"][0] for pair in pairs if pair.get("stands")]
     against = sum(pair["stands"][1] for pair in pairs if pair.get("stands"))
@@ -286,11 +264,11 @@ def standing(facts: dict[str, Any]) -> list[str]:
     if float(np.median(extents)) < MARK:
         return [
             f"{found}, and takes up a small part of them: a watermark, a clock or a part of the camera's mount is in view; give masks that "
-            f"leave it out"
+            f"exclude it"
         ]
     return [
         f"{found}: the object was turned before a standing camera, or large things move along with the camera, and poses mix both; "
-        f" give masks of the object, film it before a plain background, or walk around it while nothing turns"
+        f"give masks of the object, film it before a plain background, or walk around it while nothing turns"
     ]
 
 

@@ -1,8 +1,8 @@
-"""What the parent tells the pose-finding child, and where both keep files. No pycolmap here."""
+"""What the parent gives the pose-finding child, and where both keep files. No pycolmap here."""
 
 from __future__ import annotations
 
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -21,37 +21,16 @@ GONE_FAR = "incremental, gone on with tiny angles"  # the same from there, where
 LOOSE = "incremental, small angles"  # from scratch, by looser rules
 GLOBAL = "global"  # the last attempt, which takes what no other can begin with
 VERSION = 5  # of what is found and how; a change discards what earlier versions left in out/sparse
-REPEATABLE = 300  # pictures up to which poses repeat: one thread maps (docs/measured/performance.md)
+REPEATABLE = 300  # images up to which poses repeat: one thread maps (docs/measured/performance.md)
 
 
-@dataclass(frozen=True)
-class Picture:
-    """One picture that the child reads."""
+# Of a frame what the child needs, and what is named only where it is so: what was found before there was such a thing stays good.
+NEEDED, SELDOM = ("name", "image", "mask", "video_index", "focal_prior", "as_stored", "mask_excludes"), ("as_stored", "mask_excludes")
 
-    name: str
-    image: str
-    mask: str | None = None
-    video_index: int | None = None
-    focal_prior: float | None = None
-    as_stored: bool = False
-    mask_excludes: bool = False
 
-    def frame(self) -> Frame:
-        """As the capture's readers want it."""
-        return Frame(
-            name=self.name,
-            image=Path(self.image),
-            mask=None if self.mask is None else Path(self.mask),
-            video_index=self.video_index,
-            focal_prior=self.focal_prior,
-            as_stored=self.as_stored,
-            mask_excludes=self.mask_excludes,
-        )
-
-    def key(self) -> dict[str, Any]:
-        """Of what is seen in it."""
-        # Named only where it is so: what was found for other pictures before there was such a thing stays good.
-        return {name: value for name, value in asdict(self).items() if name not in ("as_stored", "mask_excludes") or value}
+def _plain(frame: Frame) -> dict[str, Any]:
+    values = {name: getattr(frame, name) for name in NEEDED if name not in SELDOM or getattr(frame, name)}
+    return {name: str(value) if isinstance(value, Path) else value for name, value in values.items()}
 
 
 @dataclass(frozen=True)
@@ -59,10 +38,10 @@ class Job:
     """Everything that decides the child's result."""
 
     folder: str  # out/sparse
-    pictures: tuple[Picture, ...]
+    images: tuple[Frame, ...]
     sequential: bool
-    one_camera: bool  # all pictures come from one camera at one zoom when their sizes agree
-    exif: bool  # pictures are turned upright by their EXIF orientation
+    one_camera: bool  # all images come from one camera at one zoom when their sizes agree
+    exif: bool  # images are turned upright by their EXIF orientation
     image_size: int
     max_features: int
     seed: int
@@ -81,7 +60,7 @@ class Job:
 
     @property
     def records(self) -> Path:
-        """Facts of each picture, gathered while its features are extracted."""
+        """Facts of each image, gathered while its features are extracted."""
         return Path(self.folder) / "pictures.json"
 
     @property
@@ -94,47 +73,35 @@ class Job:
 
     @property
     def repeating(self) -> int:
-        """Threads for what would not repeat with several: COLMAP's mapping. Only many pictures take all the same."""
-        return 1 if len(self.pictures) <= REPEATABLE else self.threads
+        """Threads for what would not repeat with several: COLMAP's mapping. Only many images take all the same."""
+        return 1 if len(self.images) <= REPEATABLE else self.threads
 
     def key(self) -> str:
-        """Of what features and matches depend on: not on threads, not on what the mapper is told."""
-        pictures = [[picture.key(), Path(picture.image)] for picture in self.pictures]
-        flat = [part for pair in pictures for part in pair] + [Path(picture.mask) for picture in self.pictures if picture.mask]
+        """Of what features and matches depend on: not on threads, nor on how it is mapped."""
+        flat = [part for image in self.images for part in (_plain(image), image.image)]
+        masks = [image.mask for image in self.images if image.mask]
         how = [self.sequential, self.one_camera, self.exif, self.image_size, self.max_features, self.seed, self.features]
-        return fingerprint(VERSION, *how, *flat)
+        return fingerprint(VERSION, *how, *flat, *masks)
 
     def save(self, path: Path) -> None:
-        write_json(path, asdict(self))
+        write_json(path, {**vars(self), "images": [_plain(image) for image in self.images]})
 
     @classmethod
     def load(cls, path: Path) -> Job:
         data: dict[str, Any] = read_json(path)
-        return cls(**{**data, "pictures": tuple(Picture(**picture) for picture in data["pictures"])})
+        paths = [{name: Path(image[name]) for name in ("image", "mask") if image[name]} for image in data["images"]]
+        return cls(**{**data, "images": tuple(Frame(**{**image, **own}) for image, own in zip(data["images"], paths, strict=True))})
 
 
 def plan(
     capture: Capture, folder: Path, settings: PosesSettings, seed: int, threads: int, features: str = SIFT, second: str | None = None
 ) -> Job:
     """The job for `capture`. Intrinsics and poses that the capture brings are not used; focal lengths from EXIF are."""
-    pictures = tuple(
-        Picture(
-            name=frame.name,
-            image=str(frame.image),
-            mask=None if frame.mask is None else str(frame.mask),
-            video_index=frame.video_index,
-            focal_prior=frame.focal_prior,
-            as_stored=frame.as_stored,
-            mask_excludes=frame.mask_excludes,
-        )
-        for frame in capture.frames
-    )
-    priors = {None if picture.focal_prior is None else round(picture.focal_prior, 1) for picture in pictures}
-    sequential = capture.ordered if settings.matching == "auto" else settings.matching == "sequential"
+    priors = {None if frame.focal_prior is None else round(frame.focal_prior, 1) for frame in capture.frames}
     return Job(
         folder=str(folder),
-        pictures=pictures,
-        sequential=sequential,
+        images=capture.frames,
+        sequential=capture.ordered if settings.matching == "auto" else settings.matching == "sequential",
         one_camera=capture.kind == "video" or SELECTED in capture.extra or len(priors) == 1,
         exif=turns_by_exif(capture),
         image_size=settings.image_size,

@@ -1,7 +1,7 @@
-"""Frames far apart that look alike and are not the same place: what they seem to share is taken back, and the mapper asked again.
+"""Frames far apart that look alike and are not the same place: what they seem to share is taken back, and mapping repeated.
 
 A can with the same print on both sides, a table with four legs, a corridor of equal doors: matched across, they fold the way of the
-camera together, and all frames are registered with a small error. The way itself tells. Neighbouring frames see the same side, so how far
+camera together, and all frames are registered with a small error. The way shows it. Neighbouring frames see the same side, so how far
 the camera turned between two of them does not hang on what was matched far off, and a model that has them turned otherwise is folded. Then
 frames are mapped by their near neighbours alone, and of the matches between frames far apart those stay that agree with that.
 
@@ -22,15 +22,14 @@ import pycolmap
 
 from fieldfuse.camera import Array, Intrinsics
 from fieldfuse.files import remove
-from fieldfuse.poses.agreement import agreement
-from fieldfuse.poses.database import MIN_INLIERS
+from fieldfuse.poses.database import MIN_INLIERS, Report, keypoints_of, opened
 from fieldfuse.poses.job import Job
-from fieldfuse.poses.mapping import Model, Report, calibrate, joined, map_pictures, plain
+from fieldfuse.poses.mapping import Model, agreement, calibrate, joined, map_images, plain
 from fieldfuse.poses.match import match
 from fieldfuse.poses.overlap import guessed_depth, overlap, parallax
 
 NEIGHBOURS = 2  # frames apart that show the same side of things
-CONTRADICTS = np.radians(60.0)  # between the turn that a pair of pictures tells and the model's: a few blurred points are off by less
+CONTRADICTS = np.radians(60.0)  # between the turn of a pair of images and the model's: a few blurred points are off by less
 MIN_FOLD_PAIRS = 3  # such pairs of neighbours that make a fold: one fold between two frames parts so many
 NEAR = (10, 5, 3)  # frames apart whose matches are believed when a model is folded; fewer when the model of these is folded, too
 AGREES = np.radians(30.0)  # matches farther apart stay within this: what a long way adds up to without loops
@@ -39,22 +38,22 @@ CHAINED = 5  # frames apart whose turns are put one after the other before anyth
 # without up to 0.95 and 0.31 (docs/measured/performance.md).
 SUSPECT, TOLD = 0.8, 0.5
 BORNE_OUT = 0.5  # … and that contradict the model of near neighbours, too
-MEETINGS = 4  # pairs far apart that are matched for each picture, where the near model says that cameras meet
+MEETINGS = 4  # pairs far apart that are matched for each image, where cameras meet in the near model
 WIDEST = 25.0  # degrees of parallax between two such cameras
 CLOSED = 0.7  # share of a frame's far matches that agree with a closed loop: of nine frames in ten
-COMMON = 0.4  # of both pictures, that they have to share
+COMMON = 0.4  # of both images, that they have to share
 KEPT = 0.5  # share of the folded model's frames that another one has to hold …
 KEPT_PHOTOS = 0.9  # … and of photos', whose neighbours by name may be of other things, or where none was mapped
 
 
 @dataclass(frozen=True)
 class Turns:
-    """How far the camera turned between two pictures, by what they share: of every verified pair."""
+    """How far the camera turned between two images, by what they share: of every verified pair."""
 
-    first: Array  # (P,) int64 index into the job's pictures
+    first: Array  # (P,) int64 index into the job's images
     second: Array  # (P,) int64
     turn: Array  # (P, 3, 3) the second camera's axes from the first's
-    images: Array  # (P, 2) int64 the pictures' ids in the database
+    images: Array  # (P, 2) int64 the images' ids in the database
     shared: Array  # (P,) int64 verified matches
 
     @property
@@ -63,18 +62,18 @@ class Turns:
         return np.abs(self.second - self.first)
 
 
-Mapped = tuple[Model, list[dict[str, Any]], dict[str, int] | None]  # a model, its attempts, and what is told of folds (`without_folds`)
+Mapped = tuple[Model, list[dict[str, Any]], dict[str, int] | None]  # a model, its attempts, and the counts of folds (`without_folds`)
 
 
 def never_folded(job: Job, report: Report) -> Mapped | None:
-    """What `without_folds` would come to, without mapping the folded way first, where the pairs of pictures alone tell of a fold: most of
+    """What `without_folds` would come to, without mapping the folded way first, where the pairs of images alone show a fold: most of
     those far apart contradict the turns from frame to frame, and then the model of near neighbours. None where they do not, or nothing came
     of it: then everything is mapped."""
 
     def alone(done: float, total: float, note: str) -> None:
         report(0, total, f"{note} (near neighbours alone)")
 
-    count, seen = len(job.pictures), turns(job)
+    count, seen = len(job.images), turns(job)
     # A guessed focal length that is off turns every step too far or too little, so that a circle does not close: a first sieve, and cheap.
     if contradicted(seen, chained(seen, count)) < SUSPECT:
         return None
@@ -97,7 +96,7 @@ def never_folded(job: Job, report: Report) -> Mapped | None:
 
 
 def without_folds(job: Job, model: Model, attempts: list[dict[str, Any]], report: Report) -> Mapped:
-    """The model and its attempts as they came from `map_pictures`, or, where the way of the camera is folded, better ones.
+    """The model and its attempts as they came from `map_images`, or, where the way of the camera is folded, better ones.
 
     Returns:
         with them, None where nothing was folded, else counts: pairs of neighbours that are `contradicting` the folded model, and how many
@@ -137,7 +136,7 @@ def _held_against(job: Job, near: Model, reach: int, report: Report) -> tuple[Mo
         found = joined(copy, near, report)
         tried = [] if found is None else [{"attempt": found.attempt, "models": [len(found.registered)]}]
         if found is None or len(found.registered) < len(near.registered) or not _closed(copy, found, reach):
-            found, tried = map_pictures(copy, report)
+            found, tried = map_images(copy, report)
     left = 0 if found is None else contradictions(every, axes(found))
     return found, tried, {"left": left, "far": int(far.sum()), "dropped": int(false.sum())}
 
@@ -149,32 +148,28 @@ def _closed(job: Job, model: Model, reach: int) -> bool:
 
 
 def _by_neighbours(job: Job, seen: Turns, reach: int, report: Report) -> Model | None:
-    """The model of what pictures at most `reach` apart share."""
+    """The model of what images at most `reach` apart share."""
     with copied(job) as copy:
         _drop(copy, seen, seen.apart > reach)
-        return map_pictures(copy, report)[0]
+        return map_images(copy, report)[0]
 
 
 def _calibrated(job: Job, seen: Turns) -> dict[int, pycolmap.Camera]:
-    """Cameras by id, their focal lengths by what near neighbours tell (of every pair's fundamental matrix)."""
+    """Cameras by id, their focal lengths by near neighbours (by every pair's fundamental matrix)."""
     with copied(job) as copy:
         _drop(copy, seen, seen.apart > CHAINED)
         calibrate(copy.database, job.seed)
-        database = pycolmap.Database.open(copy.database)
-        try:
+        with opened(copy.database) as database:
             return {camera.camera_id: camera for camera in database.read_all_cameras()}
-        finally:
-            database.close()
 
 
 def turns(job: Job, lenses: Mapping[int, pycolmap.Camera] | None = None) -> Turns:
     """Of all verified pairs of the job's database, with `lenses` by camera id, as a model or a calibration found them, else as guessed."""
-    database = pycolmap.Database.open(job.database)
-    try:
+    rows = []
+    with opened(job.database) as database:
         images = {image.image_id: image for image in database.read_all_images()}
         cameras = {camera.camera_id: camera for camera in database.read_all_cameras()} | dict(lenses or {})
-        points = {image_id: np.asarray(database.read_keypoints(image_id), dtype=np.float64).reshape(-1, 4)[:, :2] for image_id in images}
-        rows = []
+        points = {image_id: found[:, :2].astype(np.float64) for image_id, found in keypoints_of(database).items()}
         for pair_id, geometry in zip(*database.read_two_view_geometries(), strict=True):
             if len(geometry.inlier_matches) < MIN_INLIERS:
                 continue
@@ -183,25 +178,19 @@ def turns(job: Job, lenses: Mapping[int, pycolmap.Camera] | None = None) -> Turn
             if pycolmap.estimate_two_view_geometry_pose(pair[0], points[a], pair[1], points[b], geometry):
                 turn, shared = geometry.cam2_from_cam1.rotation.matrix(), len(geometry.inlier_matches)
                 rows.append((int(images[a].name), int(images[b].name), turn, (a, b), shared))
-    finally:
-        database.close()
-    return Turns(
-        np.array([row[0] for row in rows], dtype=np.int64),
-        np.array([row[1] for row in rows], dtype=np.int64),
-        np.array([row[2] for row in rows], dtype=np.float64).reshape(-1, 3, 3),
-        np.array([row[3] for row in rows], dtype=np.int64).reshape(-1, 2),
-        np.array([row[4] for row in rows], dtype=np.int64),
-    )
+    columns = list(zip(*rows, strict=True)) if rows else [()] * 5
+    first, second, ids, number = (np.array(columns[k], dtype=np.int64) for k in (0, 1, 3, 4))
+    return Turns(first, second, np.array(columns[2], dtype=np.float64).reshape(-1, 3, 3), ids.reshape(-1, 2), number)
 
 
 def axes(model: Model) -> dict[int, Array]:
-    """(3, 3) camera_from_world rotations of the registered pictures, by their index."""
+    """(3, 3) camera_from_world rotations of the registered images, by their index."""
     images = (model.reconstruction.image(image_id) for image_id in model.registered)
     return {int(image.name): np.asarray(image.cam_from_world().rotation.matrix()) for image in images}
 
 
 def chained(seen: Turns, count: int) -> dict[int, Array]:
-    """(3, 3) camera_from_world rotations of the first of `count` pictures and all that hang on it by pairs of near neighbours, as `axes`:
+    """(3, 3) camera_from_world rotations of the first of `count` images and all that hang on it by pairs of near neighbours, as `axes`:
     each by way of the earlier one that it shares most with for the frames between them. They drift, but they are not folded."""
     best: dict[int, dict[int, tuple[float, Array]]] = {}
     for row in np.flatnonzero((seen.apart <= CHAINED) & (seen.apart > 0)):
@@ -217,14 +206,14 @@ def chained(seen: Turns, count: int) -> dict[int, Array]:
 
 
 def contradicted(seen: Turns, rotations: dict[int, Array]) -> float:
-    """Share of the pairs far apart that tell clearly of another turn than `rotations`, or of pictures that these know nothing of; 0: there
-    is no such pair."""
+    """Share of the pairs far apart that clearly have another turn than `rotations`, or whose images these do not have; 0: there is no
+    such pair."""
     far = seen.apart > NEAR[0]
     return float(np.mean(~(disagreement(seen, rotations)[far] < CONTRADICTS))) if far.any() else 0.0
 
 
 def disagreement(seen: Turns, rotations: dict[int, Array]) -> Array:
-    """(P,) radians between the turn that each pair tells and that of the cameras at `rotations`; nan where one of the two is missing."""
+    """(P,) radians between the turn of each pair and that of the cameras at `rotations`; nan where one of the two is missing."""
     off = np.full(len(seen.first), np.nan)
     known = np.array([i in rotations and j in rotations for i, j in zip(seen.first, seen.second, strict=True)], dtype=bool)
     if known.any():
@@ -235,12 +224,12 @@ def disagreement(seen: Turns, rotations: dict[int, Array]) -> Array:
 
 
 def contradictions(seen: Turns, rotations: dict[int, Array]) -> int:
-    """How many pairs of neighbours tell of another turn than `rotations`."""
+    """How many pairs of neighbours have another turn than `rotations`."""
     return int(np.count_nonzero((seen.apart <= NEIGHBOURS) & (disagreement(seen, rotations) > CONTRADICTS)))
 
 
 def meetings(model: Model) -> list[tuple[int, int]]:
-    """Pairs of pictures far apart whose cameras see much in common from nearly the same side, by the model's own poses: each picture's
+    """Pairs of images far apart whose cameras see much in common from nearly the same side, by the model's own poses: each image's
     best few. On a way that was not known before these are the loops."""
     data = plain(model)
     names, poses = np.array(data["pictures"]), np.array(data["world_from_camera"])
@@ -256,13 +245,9 @@ def meetings(model: Model) -> list[tuple[int, int]]:
 
 def _drop(job: Job, seen: Turns, which: Array) -> None:
     """Take the pairs `which` (P,) out of the job's database."""
-    database = pycolmap.Database.open(job.database)
-    try:
-        with pycolmap.DatabaseTransaction(database):
-            for a, b in seen.images[which]:
-                database.delete_two_view_geometry(int(a), int(b))
-    finally:
-        database.close()
+    with opened(job.database) as database, pycolmap.DatabaseTransaction(database):
+        for a, b in seen.images[which]:
+            database.delete_two_view_geometry(int(a), int(b))
 
 
 @contextmanager

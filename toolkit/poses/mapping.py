@@ -1,4 +1,7 @@
-"""COLMAP's mappers, tried from strict to loose until most pictures are registered. Runs in the child process only."""
+"""COLMAP's mappers, tried from strict to loose until most images are registered, and whether their models agree with the matches.
+
+Runs in the child process only.
+"""
 
 from __future__ import annotations
 
@@ -14,18 +17,19 @@ import pycolmap
 from fieldfuse.camera import OPENCV, Intrinsics
 from fieldfuse.errors import PoseError
 from fieldfuse.files import remove
+from fieldfuse.poses.database import MIN_INLIERS, Report, keypoints_of, opened
 from fieldfuse.poses.job import GLOBAL, GONE_FAR, GONE_ON, LOOSE, TOLERANCE, Job
+from fieldfuse.poses.points import epipolar_distance
 
-Report = Callable[[float, float, str], None]
 STRICT = "incremental"  # the attempt by COLMAP's own rules
-SMALL_ANGLE, TINY_ANGLE = 1.0, 0.25  # degrees between rays that a point needs in a looser attempt, and in the last that adds pictures
-LEFT_OUT, LEFT_OUT_SHARE = 3, 0.02  # pictures without a place, and share of all, that are worth that last one
+SMALL_ANGLE, TINY_ANGLE = 1.0, 0.25  # degrees between rays that a point needs in a looser attempt, and in the last that adds images
+LEFT_OUT, LEFT_OUT_SHARE = 3, 0.02  # images without a place, and share of all, that are worth that last one
 WORSE = 1.25  # times the error of the strict model that a model which went on from it may have
-ENOUGH = 0.6  # share of registered pictures below which a looser attempt is worth its time
-FEW_POINTS = 12  # a picture that sees fewer of the model's points hangs in the air: not registered
-SMALLEST = 3  # registered pictures that make a model
+ENOUGH = 0.6  # share of registered images below which a looser attempt is worth its time
+FEW_POINTS = 12  # an image that sees fewer of the model's points hangs in the air: not registered
+SMALLEST = 3  # registered images that make a model
 MAX_ERROR = 3.0  # pixels; the mean reprojection error of a model that can be trusted
-ADJUSTED_AFTER = 1.4  # times the pictures or points of the last time, after which all are adjusted again
+ADJUSTED_AFTER = 1.4  # times the images or points of the last time, after which all are adjusted again
 STEP_TOLERANCE = 1e-5  # share of the error by which an adjustment has to get better to go on, while mapping …
 LAST_TOLERANCE, LAST_STEPS = 1e-9, 30  # … and at the end; a point that flees to infinity would go on for ever
 ANGLE_SAMPLE = 2000  # points looked at for the triangulation angle
@@ -49,7 +53,7 @@ class Model:
         return len(self.registered), self.reconstruction.num_points3D()
 
 
-def map_pictures(job: Job, report: Report) -> tuple[Model | None, list[dict[str, Any]]]:
+def map_images(job: Job, report: Report) -> tuple[Model | None, list[dict[str, Any]]]:
     """The largest trustworthy model in a settled frame, and what every attempt gave: `{"attempt", "models": [frames, …]}`, largest
     first."""
     attempts: list[tuple[str, Callable[[], list[pycolmap.Reconstruction]]]] = [
@@ -62,7 +66,7 @@ def map_pictures(job: Job, report: Report) -> tuple[Model | None, list[dict[str,
     best: Model | None = None
     history = []
     for name, attempt in attempts:
-        if best is not None and best.size[0] >= _enough(name, len(job.pictures)):
+        if best is not None and best.size[0] >= _enough(name, len(job.images)):
             continue
         models = sorted((Model(found, name, _registered(found)) for found in attempt()), key=lambda model: model.size, reverse=True)
         models = [model for model in models if len(model.registered) >= SMALLEST]
@@ -76,7 +80,7 @@ def map_pictures(job: Job, report: Report) -> tuple[Model | None, list[dict[str,
 
 
 def joined(job: Job, model: Model, report: Report) -> Model | None:
-    """The model, gone on from by COLMAP's own rules with what the job's pictures match besides; None where nothing sound comes of it."""
+    """The model, gone on from by COLMAP's own rules with what the job's images match besides; None where nothing sound comes of it."""
     found = [Model(one, STRICT, _registered(one)) for one in _incremental(job, report, None, model.reconstruction)]
     best = max(found, key=lambda one: one.size, default=None)
     if best is None or len(best.registered) < SMALLEST or best.error > MAX_ERROR:
@@ -85,13 +89,18 @@ def joined(job: Job, model: Model, report: Report) -> Model | None:
     return best
 
 
-def _enough(attempt: str, pictures: int) -> float:
-    """Registered pictures from which an attempt is not worth its time."""
+def many(images: int) -> float:
+    """Images without a place that are worth another attempt."""
+    return max(LEFT_OUT, LEFT_OUT_SHARE * images)
+
+
+def _enough(attempt: str, images: int) -> float:
+    """Registered images from which an attempt is not worth its time."""
     if attempt == GONE_ON:
-        return pictures
+        return images
     if attempt == GONE_FAR:
-        return pictures - max(LEFT_OUT, LEFT_OUT_SHARE * pictures) + 0.5
-    return ENOUGH * pictures
+        return images - many(images) + 0.5
+    return ENOUGH * images
 
 
 def _better(model: Model, best: Model) -> bool:
@@ -111,13 +120,13 @@ def _options(job: Job, angle: float | None = None) -> pycolmap.IncrementalPipeli
     options = pycolmap.IncrementalPipelineOptions()
     options.num_threads = job.repeating
     options.random_seed = job.seed
-    options.extract_colors = False  # pictures may be frames of a video or turned: the points are coloured later where needed
+    options.extract_colors = False  # images may be frames of a video or turned: the points are coloured later where needed
     options.min_model_size = SMALLEST
     options.max_num_models = 10
     options.mapper.num_threads = options.num_threads
     options.mapper.random_seed = job.seed
     options.triangulation.random_seed = job.seed
-    # COLMAP would go on to the last bit after every few pictures, and find the same in twice the time (docs/measured/performance.md).
+    # COLMAP would go on to the last bit after every few images, and find the same in twice the time (docs/measured/performance.md).
     options.ba_global_frames_ratio = options.ba_global_points_ratio = ADJUSTED_AFTER
     if job.tolerance > TOLERANCE:
         options.mapper.filter_max_reproj_error = options.triangulation.complete_max_reproj_error = job.tolerance
@@ -139,7 +148,7 @@ def _incremental(
     """The models that COLMAP's incremental mapper makes, by its own rules or with `angle` by looser ones; with `start` that one, gone on
     from."""
     options = _options(job, angle)
-    total = len(job.pictures)
+    total = len(job.images)
     how = "small" if angle == SMALL_ANGLE else "tiny"
     if angle is None:
         what = "mapping" if start is None else "closing loops"
@@ -177,7 +186,7 @@ def _incremental(
 
 
 def _global(job: Job, report: Report) -> list[pycolmap.Reconstruction]:
-    report(0, len(job.pictures), "mapping all at once")
+    report(0, len(job.images), "mapping all at once")
     # Calibrating the view graph rewrites cameras and pairs: on a copy, so that a re-run starts from the same matches.
     copy = Path(job.folder) / "global.db"
     remove(copy)
@@ -212,7 +221,7 @@ def _empty(folder: Path) -> Path:
 
 def finish(job: Job, model: Model, report: Report) -> None:
     """Adjust all cameras and points once more, to the end, and settle the frame."""
-    report(len(job.pictures), len(job.pictures), "adjusting all once more")
+    report(len(job.images), len(job.images), "adjusting all once more")
     options = pycolmap.BundleAdjustmentOptions()
     options.print_summary = False
     options.ceres.solver_options.function_tolerance = LAST_TOLERANCE
@@ -227,10 +236,8 @@ def finish(job: Job, model: Model, report: Report) -> None:
 
 
 def settle(model: Model) -> None:
-    """Fix the frame that structure from motion leaves free: the first registered camera's axes, cameras at mean distance 1 of their centre.
-
-    COLMAP's own choice depends on the order in which threads finish.
-    """
+    """Fix the frame that structure from motion leaves free: the first registered camera's axes, cameras at mean distance 1 of their
+    centre. COLMAP's own choice depends on the order in which threads finish."""
     reconstruction = model.reconstruction
     first = min(model.registered, key=lambda image_id: int(reconstruction.image(image_id).name))
     centres = np.array([reconstruction.image(image_id).projection_center() for image_id in model.registered])
@@ -241,7 +248,7 @@ def settle(model: Model) -> None:
 
 
 def save_model(model: Model, names: list[str], folder: Path) -> None:
-    """COLMAP's binary files of the model, with the pictures' own names."""
+    """COLMAP's binary files of the model, with the images' own names."""
     for image_id in model.reconstruction.reg_image_ids():
         image = model.reconstruction.image(image_id)
         image.name = names[int(image.name)]
@@ -249,7 +256,7 @@ def save_model(model: Model, names: list[str], folder: Path) -> None:
 
 
 def plain(model: Model) -> dict[str, Any]:
-    """The model as plain data: cameras by picture (indices into the job's pictures), poses in our convention, points."""
+    """The model as plain data: cameras by image (indices into the job's images), poses in our convention, points."""
     reconstruction = model.reconstruction
     order = sorted(model.registered, key=lambda image_id: int(reconstruction.image(image_id).name))
     images = [reconstruction.image(image_id) for image_id in order]
@@ -258,24 +265,16 @@ def plain(model: Model) -> dict[str, Any]:
         "attempt": model.attempt,
         "pictures": [int(image.name) for image in images],
         "intrinsics": [_intrinsics(reconstruction.camera(image.camera_id)).to_dict() for image in images],
-        "world_from_camera": [_homogeneous(image.cam_from_world().inverse().matrix()) for image in images],
-        "points": [[float(value) for value in point.xyz] for point in points],
+        "world_from_camera": [[*image.cam_from_world().inverse().matrix().tolist(), [0.0, 0.0, 0.0, 1.0]] for image in images],
+        "points": [np.asarray(point.xyz, dtype=np.float64).tolist() for point in points],
         "point_errors": [float(point.error) for point in points],
         "error": model.error,
         "angle": _median_angle(reconstruction),
     }
 
 
-def _homogeneous(matrix: Any) -> list[list[float]]:
-    return [[float(value) for value in row] for row in np.asarray(matrix)] + [[0.0, 0.0, 0.0, 1.0]]
-
-
 def _intrinsics(camera: pycolmap.Camera) -> Intrinsics:
-    """COLMAP's camera in our terms; both put pixel centres at +0.5.
-
-    Raises:
-        PoseError: a lens model that the database is never given.
-    """
+    """COLMAP's camera in our terms; both put pixel centres at +0.5."""
     values = [float(value) for value in camera.params]
     if camera.model_name == "OPENCV":
         fx, fy, cx, cy, *lens = values
@@ -284,7 +283,7 @@ def _intrinsics(camera: pycolmap.Camera) -> Intrinsics:
         fy, lens = fx, [k, 0.0, 0.0, 0.0]
     else:
         raise PoseError(
-            f"the lens model {camera.model_name} came back from mapping, which was not asked for; remove the sparse folder and run again"
+            f"the lens model {camera.model_name} came back from mapping, which no camera had; remove the sparse folder and run again"
         )
     return Intrinsics(int(camera.width), int(camera.height), fx, fy, cx, cy, OPENCV, tuple(lens))
 
@@ -299,3 +298,54 @@ def _median_angle(reconstruction: pycolmap.Reconstruction) -> float:
         rays /= np.maximum(np.linalg.norm(rays, axis=1, keepdims=True), 1e-12)
         angles.append(float(np.degrees(np.arccos(np.clip((rays @ rays.T).min(), -1.0, 1.0)))))
     return float(np.median(angles)) if angles else 0.0
+
+
+# --------------------------------------------------------------------------------------------------- agreement
+
+
+def agreement(job: Job, model: Model, apart: int = 0) -> dict[int, float]:
+    """For each placed image (its index in the job) the share of its matches with other placed ones that agree with their cameras, of
+    those more than `apart` away in order; 0 without any.
+
+    A verified pair's inliers agree with one fundamental matrix, whichever. Where many do not agree with the cameras, the mapper has put an
+    image to a place that only some of its matches support, as happens to few photos that stand far apart.
+    """
+    with opened(job.database) as database:
+        index = {image.image_id: int(image.name) for image in database.read_all_images()}
+        keypoints = keypoints_of(database)
+        pairs = list(zip(*database.read_two_view_geometries(), strict=True))
+    placed = {int(image.name): image for image in (model.reconstruction.image(image_id) for image_id in model.registered)}
+    agree, total = dict.fromkeys(placed, 0), dict.fromkeys(placed, 0)
+    for pair_id, geometry in pairs:
+        first, second = pycolmap.pair_id_to_image_pair(pair_id)
+        matches = np.asarray(geometry.inlier_matches).reshape(-1, 2)
+        here, there = index[first], index[second]
+        if len(matches) < MIN_INLIERS or here not in placed or there not in placed or abs(here - there) <= apart:
+            continue
+        cameras = [model.reconstruction.camera(placed[i].camera_id) for i in (here, there)]
+        rays = [
+            camera.cam_from_img(keypoints[image_id][matches[:, side], :2].astype(np.float64))
+            for side, (camera, image_id) in enumerate(zip(cameras, (first, second), strict=True))
+        ]
+        moved = np.vstack([(placed[there].cam_from_world() * placed[here].cam_from_world().inverse()).matrix(), [0, 0, 0, 1]])
+        near = int(np.count_nonzero(epipolar_distance(moved, *rays) * cameras[0].mean_focal_length() < job.tolerance))
+        for i in (here, there):
+            agree[i] += near
+            total[i] += len(matches)
+    return {i: agree[i] / total[i] if total[i] else 0.0 for i in sorted(placed)}
+
+
+def leave_out(model: Model, shares: dict[int, float], least: float) -> dict[int, float]:
+    """Take images that fewer than `least` of their matches agree with out of the model, where these are a quarter of it at most.
+
+    Of more it is open which are right. What is left of `shares` comes back.
+    """
+    doubtful = [i for i, share in shares.items() if share < least]
+    if not doubtful or 4 * len(doubtful) > len(shares) or len(shares) - len(doubtful) < SMALLEST:
+        return shares
+    for image_id in list(model.registered):
+        image = model.reconstruction.image(image_id)
+        if int(image.name) in doubtful:
+            model.reconstruction.deregister_frame(image.frame_id)
+            model.registered.remove(image_id)
+    return {i: share for i, share in shares.items() if i not in doubtful}

@@ -1,4 +1,4 @@
-"""Matching and verifying pairs of pictures by COLMAP, in several processes. Runs in the child process only."""
+"""Matching and verifying pairs of images by COLMAP, in several processes. Runs in the child process only."""
 
 from __future__ import annotations
 
@@ -17,8 +17,7 @@ import pycolmap
 
 from fieldfuse.camera import Array
 from fieldfuse.files import atomic_path, remove
-from fieldfuse.poses.database import Report, label
-from fieldfuse.poses.features import floats
+from fieldfuse.poses.database import Report, floats, label, opened
 from fieldfuse.poses.job import XFEAT, Job
 
 # Learned features nearly always match something, and of hundreds of false matches some dozens agree with some geometry or other.
@@ -31,7 +30,7 @@ MOST_COPIED = 2**30  # bytes of all copies of the database, of which each proces
 
 
 def match(job: Job, pairs: list[tuple[int, int]], report: Report) -> None:
-    """Match and verify `pairs` (indices into the job's pictures); those in the database already are skipped. Nobody else has the database
+    """Match and verify `pairs` (indices into the job's images); those in the database already are skipped. Nobody else has the database
     open meanwhile.
 
     What is found does not depend on the threads. Two threads that match in one process, COLMAP's or ours, gave some pairs other matches now
@@ -40,28 +39,27 @@ def match(job: Job, pairs: list[tuple[int, int]], report: Report) -> None:
     left = _left(job, pairs)
     total = len(left)
 
-    def tell(done: int) -> None:
+    def show(done: int) -> None:
         before = 0.5 if job.features == XFEAT else 0.0
         report(before * total + (1 - before) * done, total, f"matching, pair {done} of {total}")
 
     if job.features == XFEAT:
         _compare(job, left, lambda done: report(done / 2, total, f"matching, pair {done} of {total}"))
-    tell(0)
+    show(0)
     with suppress(RuntimeError):  # no room for what copies grow to, or a process ended for its memory: what is left is matched here
-        _together(job, left, tell)
+        _together(job, left, show)
     left = _left(job, left)
     done = total - len(left)
     for step in _steps(left):
         _match(job, Path(job.folder), step)
-        tell(done := done + len(step))
+        show(done := done + len(step))
 
 
-def _compare(job: Job, pairs: list[tuple[int, int]], tell: Callable[[int], None]) -> None:
+def _compare(job: Job, pairs: list[tuple[int, int]], show: Callable[[int], None]) -> None:
     """Put the matches of learned features into the job's database, which COLMAP's matcher then only verifies."""
     from fieldfuse.poses.xfeat import mutual
 
-    database = pycolmap.Database.open(job.database)
-    try:
+    with opened(job.database) as database:
         ids = {int(image.name): image.image_id for image in database.read_all_images()}
 
         @lru_cache(maxsize=MOST_DESCRIBED)
@@ -71,26 +69,21 @@ def _compare(job: Job, pairs: list[tuple[int, int]], tell: Callable[[int], None]
         new = [(i, j) for i, j in pairs if not database.exists_matches(ids[i], ids[j])]
         with ThreadPoolExecutor(job.threads) as pool:
             for done, step in enumerate(_steps(new)):
-                tell(len(pairs) - len(new) + done * PAIRS_A_STEP)
+                show(len(pairs) - len(new) + done * PAIRS_A_STEP)
                 found = pool.map(mutual, [described(i) for i, _ in step], [described(j) for _, j in step])
                 with pycolmap.DatabaseTransaction(database):
                     for (i, j), matches in zip(step, found, strict=True):
                         database.write_matches(ids[i], ids[j], matches)
-    finally:
-        database.close()
 
 
 def _steps(pairs: list[tuple[int, int]]) -> list[list[tuple[int, int]]]:
-    """Pairs that are matched before the next word is heard."""
+    """Pairs that are matched between two progress reports."""
     return [pairs[start : start + PAIRS_A_STEP] for start in range(0, len(pairs), PAIRS_A_STEP)]
 
 
-def _together(job: Job, pairs: list[tuple[int, int]], tell: Callable[[int], None]) -> None:
-    """Match in several processes, where there is more than one thread and one step, and room; else nothing.
-
-    Raises:
-        RuntimeError: one of them failed; what the others did is kept.
-    """
+def _together(job: Job, pairs: list[tuple[int, int]], show: Callable[[int], None]) -> None:
+    """Match in several processes, where there is more than one thread and one step, and room; else nothing. A RuntimeError where one of
+    them failed; what the others did stays."""
     steps, done, lock = _steps(pairs), 0, threading.Lock()
     free: SimpleQueue[Path] = SimpleQueue()
     with _copies(job, min(job.threads, MOST_MATCHERS, len(steps))) as folders:
@@ -110,7 +103,7 @@ def _together(job: Job, pairs: list[tuple[int, int]], tell: Callable[[int], None
                     processes.submit(_match, job, folder, step).result()
                     with lock:
                         _bring(folder / job.database.name, job.database, step)
-                        tell(done := done + len(step))
+                        show(done := done + len(step))
                 finally:
                     free.put(folder)
 
@@ -123,13 +116,10 @@ def _together(job: Job, pairs: list[tuple[int, int]], tell: Callable[[int], None
 
 def _left(job: Job, pairs: list[tuple[int, int]]) -> list[tuple[int, int]]:
     """Those of the pairs that are not both matched and verified."""
-    database = pycolmap.Database.open(job.database)
-    try:
+    with opened(job.database) as database:
         ids = {int(image.name): image.image_id for image in database.read_all_images()}
         both = (database.exists_matches, database.exists_two_view_geometry)
         return [(i, j) for i, j in pairs if not all(exists(ids[i], ids[j]) for exists in both)]
-    finally:
-        database.close()
 
 
 @contextmanager
@@ -153,7 +143,7 @@ def _copies(job: Job, count: int) -> Iterator[list[Path]]:
 
 
 def _end_with_parent() -> None:
-    """In a process that matches: never outlive the one that asked."""
+    """In a process that matches: never outlive the one that started it."""
     parent = parent_process()
     assert parent is not None
 
@@ -184,20 +174,13 @@ def _match(job: Job, folder: Path, pairs: list[tuple[int, int]]) -> None:
 
 
 def _bring(source: Path, target: Path, pairs: list[tuple[int, int]]) -> None:
-    """Copy what was found for `pairs` from one database to another with the same pictures.
-
-    By COLMAP's own SQLite: two of these libraries in one process know nothing of each other's locks.
-    """
-    found, database = pycolmap.Database.open(source), pycolmap.Database.open(target)
-    try:
+    """Copy what was found for `pairs` from one database to another with the same images. By COLMAP's own SQLite: two of these libraries in
+    one process do not respect each other's locks."""
+    with opened(source) as found, opened(target) as database, pycolmap.DatabaseTransaction(database):
         ids = {int(image.name): image.image_id for image in found.read_all_images()}
-        with pycolmap.DatabaseTransaction(database):
-            for i, j in pairs:
-                first, second = ids[i], ids[j]
-                if found.exists_matches(first, second) and not database.exists_matches(first, second):
-                    database.write_matches(first, second, found.read_matches(first, second))
-                if found.exists_two_view_geometry(first, second) and not database.exists_two_view_geometry(first, second):
-                    database.write_two_view_geometry(first, second, found.read_two_view_geometry(first, second))
-    finally:
-        found.close()
-        database.close()
+        for i, j in pairs:
+            first, second = ids[i], ids[j]
+            if found.exists_matches(first, second) and not database.exists_matches(first, second):
+                database.write_matches(first, second, found.read_matches(first, second))
+            if found.exists_two_view_geometry(first, second) and not database.exists_two_view_geometry(first, second):
+                database.write_two_view_geometry(first, second, found.read_two_view_geometry(first, second))

@@ -8,7 +8,7 @@ import numpy as np
 
 from fieldfuse.camera import Array, Intrinsics, invert
 
-GRID = 5  # pixels a side of the lattice that stands for a picture
+GRID = 5  # pixels a side of the lattice that stands for an image
 SWEET = 8.0  # degrees of parallax that suit matching and triangulation best
 NARROW = 3.0  # degrees: how fast the worth falls below the sweet spot
 WIDE = 12.0  # degrees: how fast it falls above
@@ -45,52 +45,52 @@ def guessed_depth(world_from_camera: Array) -> float:
     return max(spread, 1e-9)
 
 
-def overlap(world_from_camera: Array, intrinsics: Sequence[Intrinsics], depth: float | Array) -> Array:
-    """(N, N) share of picture i, taken as a plane at `depth` (one, or (N,) one a frame), that lies inside picture j. Lenses are ignored."""
-    count = len(world_from_camera)
-    depths = np.broadcast_to(np.asarray(depth, dtype=np.float64), (count,))
+def _lattice(world_from_camera: Array, intrinsics: Sequence[Intrinsics], depth: float | Array) -> Array:
+    """(N, grid, 3) points in the world of a lattice of each image, taken as a plane at `depth` (one, or (N,) one a frame). Lenses are
+    ignored."""
     steps = (np.arange(GRID) + 0.5) / GRID
     u, v = (axis.ravel() for axis in np.meshgrid(steps, steps))
-    shares = np.zeros((count, count))
+    flat = [
+        np.stack([(u * one.width - one.cx) / one.fx, (v * one.height - one.cy) / one.fy, np.ones_like(u)], axis=1) for one in intrinsics
+    ]
+    depths = np.broadcast_to(np.asarray(depth, dtype=np.float64), (len(flat),))
+    points = np.array(flat).reshape(-1, len(u), 3) * depths[:, None, None]
+    return np.asarray(points @ np.swapaxes(world_from_camera[:, :3, :3], 1, 2) + world_from_camera[:, None, :3, 3])
+
+
+def overlap(world_from_camera: Array, intrinsics: Sequence[Intrinsics], depth: float | Array) -> Array:
+    """(N, N) share of image i, taken as a plane at `depth` (one, or (N,) one a frame), that lies inside image j. Lenses are ignored."""
     camera_from_world = invert(world_from_camera)
-    size = np.array([[c.width, c.height] for c in intrinsics], dtype=np.float64)
-    focal = np.array([[c.fx, c.fy] for c in intrinsics])
-    centre = np.array([[c.cx, c.cy] for c in intrinsics])
-    for i in range(count):
-        flat = (np.stack([u, v], axis=1) * size[i] - centre[i]) / focal[i]
-        points = np.concatenate([flat, np.ones((len(flat), 1))], axis=1) * depths[i]  # (grid, 3)
-        world = points @ world_from_camera[i, :3, :3].T + world_from_camera[i, :3, 3]
+    size = np.array([[c.width, c.height] for c in intrinsics], dtype=np.float64).reshape(-1, 1, 2)
+    focal = np.array([[c.fx, c.fy] for c in intrinsics]).reshape(-1, 1, 2)
+    centre = np.array([[c.cx, c.cy] for c in intrinsics]).reshape(-1, 1, 2)
+    shares = np.zeros((len(intrinsics), len(intrinsics)))
+    for i, world in enumerate(_lattice(world_from_camera, intrinsics, depth)):
         seen = np.einsum("nij,gj->ngi", camera_from_world[:, :3, :3], world) + camera_from_world[:, None, :3, 3]  # (N, grid, 3)
         z = seen[..., 2]
-        pixels = seen[..., :2] / np.where(z > 1e-9, z, 1.0)[..., None] * focal[:, None] + centre[:, None]
-        inside = (z > 1e-9) & np.all((pixels >= 0) & (pixels <= size[:, None]), axis=-1)
-        shares[i] = inside.mean(axis=1)
+        pixels = seen[..., :2] / np.where(z > 1e-9, z, 1.0)[..., None] * focal + centre
+        shares[i] = ((z > 1e-9) & np.all((pixels >= 0) & (pixels <= size), axis=-1)).mean(axis=1)
     return shares
 
 
 def parallax(world_from_camera: Array, depth: float | Array) -> Array:
     """(N, N) degrees under which frame i's central point at `depth` sees the two cameras."""
-    centres, axes = world_from_camera[:, :3, 3], world_from_camera[:, :3, 2]
-    points = centres + axes * np.broadcast_to(np.asarray(depth, dtype=np.float64), (len(centres),))[:, None]
-    own = centres - points  # (N, 3)
-    other = centres[None] - points[:, None]  # (N, N, 3)
-    cosine = np.einsum("ni,nmi->nm", own, other) / np.maximum(np.linalg.norm(own, axis=1)[:, None] * np.linalg.norm(other, axis=-1), 1e-15)
-    angles: Array = np.degrees(np.arccos(np.clip(cosine, -1.0, 1.0)))
-    return angles
+    depths = np.broadcast_to(np.asarray(depth, dtype=np.float64), (len(world_from_camera),))
+    return _angles(world_from_camera, (world_from_camera[:, :3, 3] + world_from_camera[:, :3, 2] * depths[:, None])[:, None])
 
 
 def spread_parallax(world_from_camera: Array, intrinsics: Sequence[Intrinsics], depth: float) -> Array:
-    """(N, N) mean degrees under which a lattice of frame i's points at `depth` sees the two cameras, the whole picture over. A camera that
-    moves along its axis sees the middle of its picture from one direction, and what lies around it from several. Lenses are ignored."""
-    steps = (np.arange(GRID) + 0.5) / GRID
-    u, v = (axis.ravel() for axis in np.meshgrid(steps, steps))
-    centres = world_from_camera[:, :3, 3]
-    angles = np.zeros((len(centres), len(centres)))
-    for i, camera in enumerate(intrinsics):
-        flat = np.stack([(u * camera.width - camera.cx) / camera.fx, (v * camera.height - camera.cy) / camera.fy, np.ones_like(u)], axis=1)
-        points = depth * flat @ world_from_camera[i, :3, :3].T + centres[i]
-        rays = points[None] - centres[:, None]  # (N, grid, 3)
-        rays = rays / np.maximum(np.linalg.norm(rays, axis=-1, keepdims=True), 1e-15)
+    """(N, N) mean degrees under which a lattice of frame i's points at `depth` sees the two cameras, the whole image over. A camera that
+    moves along its axis sees the middle of its image from one direction, and what lies around it from several. Lenses are ignored."""
+    return _angles(world_from_camera, _lattice(world_from_camera, intrinsics, depth))
+
+
+def _angles(world_from_camera: Array, points: Array) -> Array:
+    """(N, N) mean degrees between the ways from frame i's points (N, K, 3) to its own camera and to another."""
+    angles = np.zeros((len(points), len(points)))
+    for i, mine in enumerate(points):
+        rays = world_from_camera[:, None, :3, 3] - mine  # (N, K, 3)
+        rays /= np.maximum(np.linalg.norm(rays, axis=-1, keepdims=True), 1e-15)
         angles[i] = np.degrees(np.arccos(np.clip((rays * rays[i]).sum(-1), -1.0, 1.0))).mean(-1)
     return angles
 

@@ -1,16 +1,21 @@
-"""Which pairs of pictures are worth matching. Pure NumPy: no vocabulary, no downloaded weights.
+"""Which pairs of images are worth matching. Pure NumPy: no vocabulary, no downloaded weights.
 
-Pictures that overlap share their coarsest features, so a few hundred of them a picture tell overlap at a thousandth of the
+Images that overlap share their coarsest features, so a few hundred of them an image show overlap at a thousandth of the
 cost of matching all (preemptive matching, Wu 2013, "Towards linear-time incremental structure from motion").
 """
 
 from __future__ import annotations
 
+from collections.abc import Callable
+from itertools import combinations
+
 import numpy as np
 
 from fieldfuse.camera import Array
+from fieldfuse.poses.job import MAX_EXHAUSTIVE, Job
 
-COARSE = 256  # features of the largest scale looked at for each picture
+Pairs = list[tuple[int, int]]  # (i, j), i < j, ascending
+COARSE = 256  # features of the largest scale looked at for each image
 RATIO = 0.85  # of the angle to the best and to the second best match
 MIN_COMMON = 4  # coarse matches that hint at overlap
 # Frames of a video from one to the other of a pair. Tracks go on from pair to pair: with all of 1 to 10, poses are as good, and matching
@@ -21,19 +26,32 @@ EVERY_STEP = (*range(1, 11), *FAR_STEPS)
 FEW_FRAMES = 60  # up to which every step of the next ten is taken: frames lie far apart there, and each match counts
 LOOPS = 3  # such pairs of a frame at most
 LOOP_GAP = 20  # frames apart before a pair counts as a loop
+LOOP_ANCHORS = 60  # frames of a video that are compared with each other to find loops
+EACH = 20  # photos that one is matched with at most, by what they share
 
 
-def exhaustive_pairs(count: int) -> list[tuple[int, int]]:
-    """All pairs (i, j), i < j."""
-    return [(i, j) for i in range(count) for j in range(i + 1, count)]
+def choose_pairs(job: Job, sketches: Callable[[], list[Array]], report: Callable[[float, float, str], None]) -> Pairs:
+    """Ordered captures: neighbours, doubling gaps, and a few loops. Photos: all pairs while these are few, else pairs that look alike.
+
+    Args:
+        sketches: gives the coarsest descriptors of every image.
+    """
+    count = len(job.images)
+    if job.sequential:
+        report(0, count, "looking for loops")
+        return sorted({*sequential_pairs(count), *loop_pairs(sketches(), stride=max(1, -(-count // LOOP_ANCHORS)))})
+    if count <= MAX_EXHAUSTIVE:
+        return list(combinations(range(count), 2))
+    report(0, count, "choosing pairs that look alike")
+    return similar_pairs(sketches())
 
 
-def pairs_with(some: list[int], count: int) -> list[tuple[int, int]]:
-    """All pairs (i, j), i < j, of which one is in `some`."""
+def pairs_with(some: list[int], count: int) -> Pairs:
+    """All pairs of which one is in `some`."""
     return sorted({(min(i, j), max(i, j)) for i in some for j in range(count) if i != j})
 
 
-def sequential_pairs(count: int, steps: tuple[int, ...] | None = None) -> list[tuple[int, int]]:
+def sequential_pairs(count: int, steps: tuple[int, ...] | None = None) -> Pairs:
     """Each frame with those `steps` later; None: `EVERY_STEP` of few frames, `STEPS` of many."""
     steps = steps or (EVERY_STEP if count <= FEW_FRAMES else STEPS)
     return [(i, i + step) for i in range(count) for step in steps if i + step < count]
@@ -62,7 +80,7 @@ def common(first: Array, second: Array) -> int:
     return int(np.count_nonzero(angle[:, 1] < RATIO * angle[:, 0]))
 
 
-def loop_pairs(sketches: list[Array], stride: int) -> list[tuple[int, int]]:
+def loop_pairs(sketches: list[Array], stride: int) -> Pairs:
     """Pairs of far-apart frames of an ordered capture that look alike: every `stride`-th frame against every other such frame."""
     anchors = list(range(0, len(sketches), max(1, stride)))
     pairs = set()
@@ -72,8 +90,8 @@ def loop_pairs(sketches: list[Array], stride: int) -> list[tuple[int, int]]:
     return sorted(pairs)
 
 
-def similar_pairs(sketches: list[Array], each: int = 20) -> list[tuple[int, int]]:
-    """Each picture with the `each` that share most coarse features with it, and with its two neighbours in the list."""
+def similar_pairs(sketches: list[Array], each: int = EACH) -> Pairs:
+    """Each image with the `each` that share most coarse features with it, and with its two neighbours in the list."""
     count = len(sketches)
     scores = np.zeros((count, count), dtype=np.int32)
     for i in range(count):

@@ -85,26 +85,28 @@ def features_of(frame: Frame, camera: Intrinsics, exif: bool) -> Features:
     scale = min(1.0, LONG_SIDE / max(width, height))
     grey = cv2.cvtColor(np.ascontiguousarray(image[..., :3]), cv2.COLOR_RGB2GRAY)
     small = grey if scale == 1.0 else cv2.resize(grey, (round(width * scale), round(height * scale)), interpolation=cv2.INTER_AREA)
-    keypoints, descriptors = cv2.SIFT.create(nfeatures=FEATURES, contrastThreshold=0.02).detectAndCompute(small, None)
-    if descriptors is None or len(keypoints) == 0:
-        return Features(np.zeros((0, 2)), np.zeros((0, 128), np.float32), np.zeros(0, np.float32), scale * width / camera.width)
-    sizes = np.array([k.size for k in keypoints], dtype=np.float32)
-    pixels = (np.array([k.pt for k in keypoints]) + 0.5) * [camera.width / small.shape[1], camera.height / small.shape[0]]
+    at, sizes, descriptors = detect_sift(small, FEATURES, 0.02)
+    pixels = (at.astype(np.float64) + 0.5) * [camera.width / small.shape[1], camera.height / small.shape[0]]
     if usable is not None:
         kept = at_pixels(usable, pixels * [width / camera.width, height / camera.height])
         pixels, descriptors, sizes = pixels[kept], descriptors[kept], sizes[kept]
-    return Features(pixels, root_sift(descriptors), sizes, scale * width / camera.width)
+    return Features(pixels, descriptors, sizes, scale * width / camera.width)
+
+
+def detect_sift(grey: Array, most: int, contrast: float) -> tuple[Array, Array, Array]:
+    """(N, 2) float32 places in (H, W) uint8, pixel centres whole numbers; (N,) float32 diameters; (N, 128) float32 root-SIFT of length 1,
+    whose Euclidean distances compare histograms better than those of plain descriptors."""
+    found, descriptors = cv2.SIFT.create(nfeatures=most, contrastThreshold=contrast).detectAndCompute(grey, None)
+    if descriptors is None or len(found) == 0:
+        return np.zeros((0, 2), np.float32), np.zeros(0, np.float32), np.zeros((0, 128), np.float32)
+    rooted = np.sqrt(descriptors / np.maximum(descriptors.sum(axis=1, keepdims=True), 1e-6)).astype(np.float32)
+    return np.array([k.pt for k in found], dtype=np.float32), np.array([k.size for k in found], dtype=np.float32), rooted
 
 
 def at_pixels(values: Array, pixels: Array) -> Array:
     """(N,) values (H, W) at pixels (N, 2), centres at +0.5; those outside count as at the rim."""
     height, width = values.shape[:2]
     return np.asarray(values[np.clip(pixels[:, 1].astype(int), 0, height - 1), np.clip(pixels[:, 0].astype(int), 0, width - 1)])
-
-
-def root_sift(descriptors: Array) -> Array:
-    """(N, 128) float32 of unit length: Euclidean distances of these compare histograms better than those of plain descriptors."""
-    return np.sqrt(descriptors / np.maximum(descriptors.sum(axis=1, keepdims=True), 1e-6)).astype(np.float32)
 
 
 def neighbour_pairs(poses: Array, cameras: Sequence[Intrinsics], count: int) -> list[tuple[int, int]]:

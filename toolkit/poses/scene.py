@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field, fields, replace
 from typing import Any
 
 import numpy as np
@@ -10,11 +10,9 @@ import numpy as np
 from fieldfuse.camera import Array, Similarity
 from fieldfuse.capture.types import Capture
 from fieldfuse.errors import InputError, PoseError, first_line
-from fieldfuse.poses.cloud import Cloud, cloud_of_depth, cloud_of_points
-from fieldfuse.poses.gravity import camera_frame, tight_turn, turn_about_z
-from fieldfuse.poses.hull import silhouette_cloud
+from fieldfuse.poses.cloud import Cloud, cloud_of_depth, cloud_of_points, silhouette_cloud
 from fieldfuse.poses.points import Features, triangulate
-from fieldfuse.poses.region import FORWARD, ROOM, Layout, box, layout, points_of_interest
+from fieldfuse.poses.region import FORWARD, ROOM, Layout, box, camera_frame, layout, points_of_interest, tight_turn, turn_about_z
 from fieldfuse.progress import SILENT, Progress
 
 MEDIAN_DEPTH = 1.5  # working units, for captures without scale
@@ -39,7 +37,7 @@ class Scene:
     layout: str = "object"  # object (cameras look inwards) | room (around) | forward (one way)
     up_reason: str = ""
     points_source: str = ""  # source | depth | triangulated | silhouettes
-    points: int = 0  # how many told the above
+    points: int = 0  # of these
     warnings: list[str] = field(default_factory=list)
 
     def surface_box(self) -> tuple[Array, Array]:
@@ -50,20 +48,12 @@ class Scene:
 
     def to_dict(self) -> dict[str, Any]:
         """Plain JSON."""
+        plain = {entry.name: getattr(self, entry.name) for entry in fields(self)}
         return {
+            **plain,
             "working_from_input": self.working_from_input.to_dict(),
             "centre": self.centre.tolist(),
             "half_size": self.half_size.tolist(),
-            "median_depth": self.median_depth,
-            "near": self.near,
-            "far": self.far,
-            "background_share": self.background_share,
-            "has_background": self.has_background,
-            "metric": self.metric,
-            "layout": self.layout,
-            "up_reason": self.up_reason,
-            "points_source": self.points_source,
-            "points": self.points,
             "warnings": list(self.warnings),
         }
 
@@ -77,21 +67,13 @@ class Scene:
         try:
             if not 0 <= float(data["near"]) < float(data["far"]):
                 raise ValueError(f"depths from {data['near']} to {data['far']}")
+            kinds = {"float": float, "bool": bool, "str": str, "int": int}
             return cls(
                 working_from_input=Similarity.from_dict(data["working_from_input"]),
                 centre=np.array(data["centre"], dtype=np.float64).reshape(3),
                 half_size=np.array(data["half_size"], dtype=np.float64).reshape(3),
-                median_depth=float(data["median_depth"]),
-                near=float(data["near"]),
-                far=float(data["far"]),
-                background_share=float(data["background_share"]),
-                has_background=bool(data["has_background"]),
-                metric=bool(data["metric"]),
-                layout=str(data["layout"]),
-                up_reason=str(data["up_reason"]),
-                points_source=str(data["points_source"]),
-                points=int(data["points"]),
                 warnings=[str(text) for text in data["warnings"]],
+                **{entry.name: kinds[str(entry.type)](data[entry.name]) for entry in fields(cls) if entry.type in kinds},
             )
         except (KeyError, TypeError, ValueError, OverflowError) as error:
             raise InputError(f"scene.json is not what the poses stage writes ({first_line(error)}); remove it and run again") from error
@@ -104,7 +86,7 @@ def describe_scene(capture: Capture, progress: Progress = SILENT, known: dict[st
         known: features of images by name, found before.
 
     Raises:
-        PoseError: the capture is not posed, or too few points can be found to tell where the scene is.
+        PoseError: the capture is not posed, or too few points can be found to place the scene.
     """
     if not capture.posed:
         raise PoseError(f"{capture.root}: not every frame has a pose and intrinsics; run the poses stage first")
@@ -119,7 +101,7 @@ def describe_scene(capture: Capture, progress: Progress = SILENT, known: dict[st
     if len(cloud.points) < FEW_POINTS or len(cloud.point) == 0:
         raise PoseError(
             f"{capture.root}: only {len(cloud.points)} points could be triangulated with the given poses: they or their axis convention "
-            f"do not fit the pictures, or these show too little that is recognised in others; check the poses, use --set poses.source=sfm, "
+            f"do not fit the images, or these show too little that is recognised in others; check the poses, use --set poses.source=sfm, "
             f"or add pictures with more texture"
         )
     depth = cloud.median_depth()
@@ -143,7 +125,7 @@ def describe_scene(capture: Capture, progress: Progress = SILENT, known: dict[st
         near=0.7 * float(np.percentile(depths, 0.5)),
         far=float(max(1.2 * np.percentile(depths, 99.5), reach)),
         background_share=beyond,
-        # Without alpha or depth, pictures are full to the rim, and what has no texture left no points to count.
+        # Without alpha or depth, images are full to the rim, and what has no texture left no points to count.
         has_background=not bounded or beyond > BEYOND,
         metric=capture.metric,
         layout=found.kind,
@@ -156,14 +138,10 @@ def describe_scene(capture: Capture, progress: Progress = SILENT, known: dict[st
 def find_cloud(capture: Capture, progress: Progress = SILENT, known: dict[str, Features] | None = None) -> Cloud:
     """Points of a posed capture in the input's frame, from the best there is: silhouettes, depth, the source's own points, or
     triangulated."""
-    if capture.alpha:
-        cloud = silhouette_cloud(capture, progress)
-        if len(cloud.points) >= FEW_POINTS:
-            return cloud
-    if capture.has_depth:
-        cloud = cloud_of_depth(capture, progress)
-        if len(cloud.points) >= FEW_POINTS:
-            return cloud
+    if capture.alpha and len((cloud := silhouette_cloud(capture, progress)).points) >= FEW_POINTS:
+        return cloud
+    if capture.has_depth and len((cloud := cloud_of_depth(capture, progress)).points) >= FEW_POINTS:
+        return cloud
     if capture.points is not None and len(capture.points) >= FEW_POINTS:
         cloud = cloud_of_points(capture, np.asarray(capture.points, dtype=np.float64), "source")
         if len(cloud.point) >= FEW_POINTS:

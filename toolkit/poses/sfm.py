@@ -1,4 +1,4 @@
-"""Poses from the pictures alone. This side talks to the child process (`worker.py`) that runs pycolmap."""
+"""Poses from the images alone. This side talks to the child process (`worker.py`) that runs pycolmap."""
 
 from __future__ import annotations
 
@@ -12,7 +12,8 @@ import numpy as np
 
 from fieldfuse import errors, memory
 from fieldfuse.camera import Intrinsics
-from fieldfuse.capture.headers import read_bytes, read_header
+from fieldfuse.capture.archive import read_bytes
+from fieldfuse.capture.headers import read_header
 from fieldfuse.capture.prepare import target_size
 from fieldfuse.capture.types import Capture
 from fieldfuse.config import PosesSettings
@@ -21,12 +22,11 @@ from fieldfuse.files import read_json, remove
 from fieldfuse.poses.child import run_child
 from fieldfuse.poses.health import doubts, failure, fold, shortfalls, standing
 from fieldfuse.poses.job import GONE_FAR, GONE_ON, SIFT, XFEAT, Job, plan
-from fieldfuse.poses.result import SFM, PoseResult
-from fieldfuse.poses.sensor import scale_to_depth
+from fieldfuse.poses.result import SFM, PoseResult, scale_to_depth
 from fieldfuse.progress import SILENT, Progress
 
 WORKER = "fieldfuse.poses.worker"
-SIFT_BYTES = 240  # that OpenCV takes for a pixel of a picture in which it looks for features, whatever the picture's size
+SIFT_BYTES = 240  # that OpenCV takes for a pixel of an image in which it looks for features, whatever the image's size
 MAX_RESULT_BYTES = 2 * 2**30
 
 
@@ -38,15 +38,15 @@ def find_poses(
     threads: int | None = None,
     progress: Progress = SILENT,
 ) -> PoseResult:
-    """Structure from motion over the capture's pictures; poses and intrinsics that it brings are not looked at.
+    """Structure from motion over the capture's images; poses and intrinsics that it brings are not used.
 
-    COLMAP's database, log and model stay in `out/sparse`; features and matches there are used again when the pictures and
-    settings are the same. With the same seed the result repeats; up to `job.REPEATABLE` pictures that of the incremental
+    COLMAP's database, log and model stay in `out/sparse`; features and matches there are used again when the images and
+    settings are the same. With the same seed the result repeats; up to `job.REPEATABLE` images that of the incremental
     mapper does bit for bit, whatever the threads. A capture with depth maps gets the depth's scale.
 
     Raises:
         PoseError: no usable poses, and why; or the child process crashed.
-        InputError: a picture cannot be read, or there is too little memory.
+        InputError: an image cannot be read, or there is too little memory.
         Interrupted: the user asked to stop.
     """
     settings = settings or PosesSettings()
@@ -77,11 +77,8 @@ def find_poses(
 
 
 def _features(wanted: str) -> tuple[str, str | None, list[str]]:
-    """The features to begin with, those to try where these are not enough, and warnings.
-
-    Raises:
-        InputError: learned ones are wanted, and their weights are not there or damaged.
-    """
+    """The features to begin with, those to try where these are not enough, and warnings; an InputError where learned ones are wanted and
+    not there."""
     if wanted == SIFT:
         return SIFT, None, []
     from fieldfuse.poses import xfeat
@@ -100,7 +97,7 @@ def _features(wanted: str) -> tuple[str, str | None, list[str]]:
 
 
 def _pixels(capture: Capture, long_side: int) -> int:
-    """Of the first picture, as it is looked at for features."""
+    """Of the first image, as it is looked at for features."""
     frame = capture.frames[0]
     if frame.video_index is not None:
         width, height = int(capture.extra.get("width") or long_side), int(capture.extra.get("height") or long_side)
@@ -133,7 +130,7 @@ def _run(job: Job, seconds: dict[str, float], progress: Progress) -> dict[str, A
             kind = getattr(errors, str(message["kind"]), PoseError)
             refusals.append(kind(str(message["message"])))
 
-    # BLAS and OpenMP spin up a thread a core each unless told; COLMAP's own threads are set by the worker.
+    # BLAS and OpenMP start a thread a core each by default; COLMAP's own threads are set by the worker.
     counts = {name: str(job.threads) for name in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS")}
     run_child(WORKER, [str(folder / "job.json")], job.log, hear, progress, counts)
     if refusals:
@@ -147,7 +144,7 @@ def _run(job: Job, seconds: dict[str, float], progress: Progress) -> dict[str, A
 
 def _result(capture: Capture, job: Job, facts: dict[str, Any]) -> PoseResult:
     model = facts["model"]
-    names = [picture.name for picture in job.pictures]
+    names = [image.name for image in job.images]
     placed = [names[i] for i in model["pictures"]]
     known = set(placed)
     sizes = next(attempt["models"] for attempt in facts["attempts"] if attempt["attempt"] == model["attempt"])

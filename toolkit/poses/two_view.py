@@ -1,7 +1,7 @@
 """Matches between posed images, found without their poses, and how far they are off the epipolar geometry of any poses.
 
-Pairs are chosen by order and by what the images share; matches are verified by a fundamental matrix of their own. What they say about the
-given poses is therefore evidence, not an echo.
+Pairs are chosen by order and by what the images share; matches are verified by a fundamental matrix of their own. So they are
+evidence about the given poses, not an echo of them.
 """
 
 from __future__ import annotations
@@ -42,7 +42,6 @@ class Matches:
     there: Array  # (K, 2) in the second
     focal: Array  # (P,) working pixels
     tolerance: Array  # (P,) working pixels within which a match agrees with poses
-    moved: Array  # (P,) median displacement of features, as a share of the long side
 
     def by_pair(self, agrees: Array) -> Array:
         """(P,) share of each pair's matches for which `agrees` (K,) holds."""
@@ -52,16 +51,8 @@ class Matches:
     def subset(self, keep: Array) -> Matches:
         """The pairs for which `keep` (P,) bool holds; images keep their numbers."""
         taken = keep[self.pair]
-        number = np.cumsum(keep) - 1
-        return Matches(
-            pairs=self.pairs[keep],
-            pair=number[self.pair[taken]],
-            here=self.here[taken],
-            there=self.there[taken],
-            focal=self.focal[keep],
-            tolerance=self.tolerance[keep],
-            moved=self.moved[keep],
-        )
+        pair, here, there = (np.cumsum(keep) - 1)[self.pair[taken]], self.here[taken], self.there[taken]
+        return Matches(self.pairs[keep], pair, here, there, self.focal[keep], self.tolerance[keep])
 
     def without(self, images: Array) -> Array:
         """(P,) whether a pair holds none of the `images` (N,) bool."""
@@ -109,7 +100,7 @@ def find_matches(
         seen.append((found, undistorted(frame.intrinsics, found.pixel), sketch))
     pairs = _choose(list(frames), [sketch for _, _, sketch in seen], links, alike)
     columns: list[tuple[Array, Array]] = []
-    facts: list[tuple[int, int, float, float, float]] = []
+    facts: list[tuple[int, int, float, float]] = []
     for number, (i, j) in enumerate(pairs):
         progress.check()
         progress.update(len(frames) * (1 + number / len(pairs)), 2 * len(frames), f"checking poses, pair {number + 1} of {len(pairs)}")
@@ -120,11 +111,10 @@ def find_matches(
         if len(here) < MIN_INLIERS:
             continue
         side = max(cameras[i].width, cameras[i].height) * one.scale
-        moved = float(np.median(np.linalg.norm(here - there, axis=1))) * focal / side
-        facts.append((i, j, focal, max(AGREES * side, LEAST_PIXELS), moved))
+        facts.append((i, j, focal, max(AGREES * side, LEAST_PIXELS)))
         spread = np.linspace(0, len(here) - 1, min(MAX_MATCHES, len(here))).round().astype(int)
         columns.append((here[spread], there[spread]))
-    table = np.array(facts, dtype=np.float64).reshape(-1, 5)
+    table = np.array(facts, dtype=np.float64).reshape(-1, 4)
     empty = np.zeros((0, 2))
     return Matches(
         pairs=table[:, :2].astype(np.int64),
@@ -133,7 +123,6 @@ def find_matches(
         there=np.concatenate([there for _, there in columns]) if columns else empty,
         focal=table[:, 2],
         tolerance=table[:, 3],
-        moved=table[:, 4],
     )
 
 
@@ -203,7 +192,7 @@ def deviation(poses: Array, matches: Matches) -> Array:
 
 
 def own_motions(matches: Matches) -> tuple[Array, Array, Array]:
-    """What each pair's own essential matrix says.
+    """Rotation and direction by each pair's own essential matrix.
 
     Returns:
         (P, 3, 3) rotation and (P, 3) direction, second camera from first, and (P,) degrees between the rays of its matches in the median

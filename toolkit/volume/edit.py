@@ -60,25 +60,9 @@ def pooled_in_torch(topology: Topology, occupied: Tensor, width: int) -> Tensor:
 
 
 def _with_reached_blocks(topology: Topology, occupied: Tensor, lowest: int) -> Topology:
-    """These blocks, then the absent ones that hold a row one step (from `lowest` to +1 along each axis) beside an occupied row."""
-    if topology.bounds is not None:
-        return _with_marked_blocks(topology, occupied, lowest)
-    cube = occupied.view(-1, BLOCK, BLOCK, BLOCK)
-    parts = {-1: slice(0, 1), 0: slice(None), 1: slice(BLOCK - 1, BLOCK)}
-    steps = range(lowest, 2)
-    found = []
-    for dz, dy, dx in ((z, y, x) for z in steps for y in steps for x in steps if (z, y, x) != (0, 0, 0)):
-        reaches = cube[:, parts[dz], parts[dy], parts[dx]].flatten(1).any(1)
-        reaches &= topology.around[:, (dz + 1) * 9 + (dy + 1) * 3 + dx + 1] < 0
-        found.append(topology.keys[reaches].long() + torch.tensor([dx, dy, dz], device=topology.device))
-    new = torch.unique(torch.cat(found), dim=0)
-    return topology if len(new) == 0 else topology.alike(torch.cat([topology.keys.long(), new]))
-
-
-def _with_marked_blocks(topology: Topology, occupied: Tensor, lowest: int) -> Topology:
-    """The same by marks in the table, which reads from the device once; new blocks in the table's order."""
-    table = topology.table
-    sx, sy, sz = topology.table_size
+    """These blocks, then the absent ones that hold a row one step (from `lowest` to +1 along each axis) beside an occupied row, in the
+    order of the table. The device is read once."""
+    (sx, sy, sz), nowhere = topology.table_size, topology.table.numel()  # one more cell takes what is not reached
     # (M, 3, 3, 3) steps: whether a row of a block lies at its low end, anywhere, or at its high end along each axis.
     reaches = occupied.view(-1, BLOCK, BLOCK, BLOCK)
     for axis in (1, 2, 3):
@@ -88,11 +72,10 @@ def _with_marked_blocks(topology: Topology, occupied: Tensor, lowest: int) -> To
     steps = [(z, y, x) for z in line for y in line for x in line]
     chosen = constant(tuple(((z + 1) * 3 + y + 1) * 3 + x + 1 for z, y, x in steps), occupied.device)
     cells = constant(tuple((z * sy + y) * sx + x for z, y, x in steps), occupied.device)
-    nowhere = table.numel()  # one more cell takes what is not reached
     reached = torch.where(reaches.flatten(1)[:, chosen], topology.own_cells[:, None] + cells, nowhere)
     marks = torch.zeros(nowhere + 1, dtype=torch.bool, device=occupied.device).index_fill_(0, reached.view(-1), True)
-    new = (marks[:-1].view(sz, sy, sx) & (table < 0)).nonzero().flip(1) + constant(topology.table_origin, occupied.device)
-    return topology if len(new) == 0 else topology.alike(torch.cat([topology.keys, new.to(torch.int32)]))
+    new = (marks[:-1].view(sz, sy, sx) & (topology.table < 0)).nonzero().flip(1) + constant(topology.table_origin, occupied.device)
+    return topology if len(new) == 0 else topology.alike(torch.cat([topology.keys.long(), new]))
 
 
 def with_corner_blocks(topology: Topology, occupied: Tensor) -> tuple[Topology, Tensor]:

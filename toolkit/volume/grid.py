@@ -54,7 +54,6 @@ class BlockGrid:
         if self.device.type == "cuda" and not o3d.core.cuda.is_available():
             raise InputError("this Open3D cannot use CUDA here; choose --device cpu or install its CUDA build")
         place = f"CUDA:{self.device.index or 0}" if self.device.type == "cuda" else "CPU:0"
-        self._generation = 0
         self._views: dict[str, Tensor] = {}
         self._lent: list[weakref.ref[Tensor]] = []
         try:
@@ -82,13 +81,8 @@ class BlockGrid:
         """Blocks there is room for; rows of every attribute = capacity · 512."""
         return int(self._table().capacity())
 
-    @property
-    def generation(self) -> int:
-        """Rises whenever rows have moved (growth) or were freed (close): views taken before are void."""
-        return self._generation
-
     def reserve(self, blocks: int) -> None:
-        """Make room for at least `blocks` blocks in all. When that moves rows, the generation rises and views are void.
+        """Make room for at least `blocks` blocks in all. When that moves rows, views are void.
 
         Raises:
             InputError: not enough memory.
@@ -166,7 +160,7 @@ class BlockGrid:
     def rows(self, name: str) -> Tensor:
         """(capacity · 512, C) float32 view that shares Open3D's buffer: writes are seen by both sides.
 
-        It is void after the next growth: it then has no rows, so that a write cannot be lost in silence, and `generation` differs.
+        It is void after the next growth: it then has no rows, so that a write cannot be lost in silence.
         To optimise values in place call `requires_grad_()` on this very tensor (a `Parameter` made of it, like any tensor derived
         from it, is another handle on the old memory which the grid can neither void nor release at exit).
         """
@@ -200,7 +194,6 @@ class BlockGrid:
                 view.grad = None
                 view.data = torch.empty((0, view.shape[1]), device=view.device)
         self._lent.clear()
-        self._generation += 1
 
     def _keys(self, keys: Tensor) -> Tensor:
         if keys.ndim != 2 or keys.shape[1] != 3 or keys.is_floating_point():

@@ -122,15 +122,11 @@ def test_a_kill_between_two_files_of_a_save_costs_no_row_of_the_curve(tmp_path: 
     assert second.state.step == 1 and [row["step"] for row in second.curve.rows] == [1]
 
 
-def test_a_second_run_does_not_overwrite_the_first(tmp_path: Path) -> None:
-    Trainer(tiny_settings(), tmp_path, Crew()).run(until=1)
-    with pytest.raises(InputError, match="--resume"):
-        Trainer(tiny_settings(), tmp_path, Crew())
-
-
-def test_only_the_newest_checkpoints_are_kept(tmp_path: Path) -> None:
+def test_only_the_newest_checkpoints_stay_and_a_second_run_does_not_overwrite_them(tmp_path: Path) -> None:
     Trainer(tiny_settings(record={"checkpoint_every": 1, "keep": 2}), tmp_path, Crew()).run(until=3)
     assert [path.name for path in checkpoints(tmp_path)] == ["checkpoint-0000002.safetensors", "checkpoint-0000003.safetensors"]
+    with pytest.raises(InputError, match="--resume"):
+        Trainer(tiny_settings(), tmp_path, Crew())
 
 
 def test_a_broken_or_foreign_checkpoint_is_refused(tmp_path: Path) -> None:
@@ -315,11 +311,13 @@ def test_a_device_that_is_not_there_is_refused(device: str) -> None:
         pass
 
 
-def health_run(out: Path, steps: int, scenes: int) -> list[dict[str, float]]:
-    """Train on few scenes whose pictures come again and again, so that a short run can be compared with its own beginning."""
+def test_training_briefly_keeps_features_alive_and_finds_depth(tmp_path: Path) -> None:
+    """On two scenes whose images come again and again, so that a short run can be compared with its own beginning: features tell places
+    apart all the time, and weight moves along the rays to where the surfaces are."""
+    steps = 200
     settings = tiny_settings(
         seed=5,
-        window=scenes,
+        window=2,
         reuse=10**6,
         model={"image_channels": 32, "sampled": 16, "hidden": 16, "channels": 16, "features": 16, "direction": 8},
         pictures={"long_side": [80, 80], "frames": 5, "targets": 2, "key_frames": 1},
@@ -330,24 +328,16 @@ def health_run(out: Path, steps: int, scenes: int) -> list[dict[str, float]]:
         record={"log_every": 4, "health_every": 5000, "checkpoint_every": 10**6},
         sources=[{"kind": "procedural", "scene": "object"}],
     )
-    trainer = Trainer(settings, out, Crew())
+    trainer = Trainer(settings, tmp_path, Crew())
     trainer.run(until=steps)
-    return trainer.curve.rows
-
-
-def check_health(rows: list[dict[str, float]]) -> None:
-    """Features tell places apart all the time, and weight moves along the rays to where the surfaces are."""
-    part = max(1, len(rows) // 5)
+    rows = trainer.curve.rows
+    first, last = rows[: len(rows) // 5], rows[-(len(rows) // 5) :]
 
     def mean(name: str, some: list[dict[str, float]]) -> float:
         return float(np.mean([row[name] for row in some]))
 
     assert min(row["feature_deviation"] for row in rows) > ALIVE
-    assert mean("depth_likelihood", rows[-part:]) > mean("depth_likelihood", rows[:part]) + 0.3
-    assert mean("depth_error", rows[-part:]) < 0.8 * mean("depth_error", rows[:part])
-    assert mean("psnr_local", rows[-part:]) > mean("psnr_local", rows[:part]) + 0.5
+    assert mean("depth_likelihood", last) > mean("depth_likelihood", first) + 0.3
+    assert mean("depth_error", last) < 0.8 * mean("depth_error", first)
+    assert mean("psnr_local", last) > mean("psnr_local", first) + 0.5
     assert all(np.isfinite(row["gradient_norm"]) and row["gradient_norm"] > 0 for row in rows)
-
-
-def test_training_briefly_keeps_features_alive_and_finds_depth(tmp_path: Path) -> None:
-    check_health(health_run(tmp_path, steps=200, scenes=2))

@@ -28,9 +28,9 @@ from fieldfuse.capture.types import Capture, Frame, Views
 from fieldfuse.errors import InputError, PoseError
 from fieldfuse.evaluation.score import nearest_training
 from fieldfuse.nerfusion.keyframes import select_keyframes
-from fieldfuse.poses.given import given_poses
-from fieldfuse.poses.gravity import up_direction
 from fieldfuse.poses.points import intersect, undistorted
+from fieldfuse.poses.region import up_direction
+from fieldfuse.poses.result import given_poses
 from fieldfuse.render.paths import look_at, orbit
 from tests.stability.hard import reference
 from tests.stability.hard.errors import absolute, largest, not_finite, refused, relative

@@ -342,9 +342,9 @@ def render_pass(
     while number < len(origins):
         begun, used, rays = number, K.START, K.START
         while number < len(origins) and rays < RAYS and used < BATCH:
-            o, d = origins[number], directions[number]
             starts[rays] = used
-            line = o[0], o[1], o[2], d[0], d[1], d[2]
+            dx, dy, dz = directions[number, 0], directions[number, 1], directions[number, 2]
+            line = origins[number, 0], origins[number, 1], origins[number, 2], dx, dy, dz
             used += march_ray(space, volume, net, tape, used, line, ZERO, stop, threshold, marks, light)
             out[number, 3] = light[2]
             rays += 1

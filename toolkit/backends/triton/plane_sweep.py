@@ -236,11 +236,6 @@ def rows(volume: Tensor) -> Tensor:
     return volume.permute(1, 2, 0).contiguous()
 
 
-def semi_global(cost: Tensor, small: float, large: float) -> Tensor:
-    """(D, h, w) → the same smoothed along four directions, see `matching.semi_global`."""
-    return _paths(rows(cost), small, large).mean(0).permute(2, 0, 1)
-
-
 def smoothed_softmax(cost: Tensor, small: float, large: float, temperature: float) -> Tensor:
     """(D, h, w) costs → likelihoods, see `matching.smoothed_softmax`; planes of a pixel lie next to each other."""
     volume = rows(cost)

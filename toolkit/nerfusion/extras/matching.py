@@ -78,10 +78,6 @@ def semi_global(cost: Tensor) -> Tensor:
         even = np.zeros(whole.shape[:2], np.float32)  # depth may step anywhere
         one, other = share(lambda way: summed_paths(whole, even, SMALL, LARGE, STRAIGHT, (way,)), (DOWN, UP), torch.get_num_threads())
         return torch.from_numpy((one + other) / np.float32(4)).permute(2, 0, 1)
-    if dispatch.can_use_triton(cost):
-        from fieldfuse.backends.triton import plane_sweep
-
-        return plane_sweep.semi_global(cost, SMALL, LARGE)
     down, right = volume, volume.transpose(0, 1)
     total = _paths(down) + _paths(down.flip(0)).flip(0)
     total = total + (_paths(right) + _paths(right.flip(0)).flip(0)).transpose(0, 1)
