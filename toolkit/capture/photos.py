@@ -18,7 +18,7 @@ from typing import Any
 
 from PIL import Image
 
-from fieldfuse.capture.colmap_model import holds_model
+from fieldfuse.capture.colmap import holds_model
 from fieldfuse.capture.headers import image_header
 from fieldfuse.capture.heif import SUFFIXES as HEIF_SUFFIXES
 from fieldfuse.capture.listing import IMAGES, assemble, counted, images_in, natural_key, require_folder, some_of, words_of
