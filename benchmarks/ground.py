@@ -11,8 +11,7 @@ from typing import Any
 
 import numpy as np
 
-from fieldfuse.capture.prepare import prepare_views
-from fieldfuse.capture.subset import limited
+from fieldfuse.capture.prepare import limited, prepare_views
 from fieldfuse.capture.types import Capture, Views
 from fieldfuse.config import NetworkSettings, Settings, settings_dict
 from fieldfuse.effects.correct import Corrections

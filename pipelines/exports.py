@@ -12,9 +12,8 @@ import numpy as np
 
 from fieldfuse import memory
 from fieldfuse.camera import Array
-from fieldfuse.capture.convert import all_converted
+from fieldfuse.capture.convert import all_converted, stored_cameras
 from fieldfuse.capture.select import SELECTED
-from fieldfuse.capture.stored import stored_cameras
 from fieldfuse.capture.types import Capture
 from fieldfuse.errors import InputError
 from fieldfuse.export.cameras import write_cameras

@@ -55,8 +55,8 @@ def info(
 def source_facts(source: Path, fast: bool, quiet: bool) -> dict[str, Any]:
     """Facts of a capture; with `fast` no pixel is decoded."""
     from fieldfuse.capture import open_capture
-    from fieldfuse.capture.beside import unused
     from fieldfuse.capture.checks import check_capture
+    from fieldfuse.capture.photos import unused
     from fieldfuse.pipelines.console import make_progress
     from fieldfuse.pipelines.source import describe_capture
     from fieldfuse.poses.check_given import best_fitting

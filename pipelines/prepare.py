@@ -12,10 +12,9 @@ import numpy as np
 from fieldfuse import steps
 from fieldfuse.capture.film import DEPTH
 from fieldfuse.capture.photos import with_unposed
-from fieldfuse.capture.storage import capture_from_dict, capture_to_dict
-from fieldfuse.capture.subset import limited
+from fieldfuse.capture.prepare import limited
+from fieldfuse.capture.storage import capture_from_dict, capture_to_dict, load_views, save_views
 from fieldfuse.capture.types import Capture, Frame, Views
-from fieldfuse.capture.views_file import load_views, save_views
 from fieldfuse.effects.correct import Corrections
 from fieldfuse.errors import InputError
 from fieldfuse.files import read_json, write_json

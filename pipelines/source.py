@@ -95,7 +95,8 @@ def picture_size(capture: Capture) -> tuple[int | None, int | None]:
         return first.intrinsics.width, first.intrinsics.height
     if capture.kind == "video":
         return capture.extra.get("width"), capture.extra.get("height")
-    from fieldfuse.capture.headers import read_bytes, read_header
+    from fieldfuse.capture.archive import read_bytes
+    from fieldfuse.capture.headers import read_header
 
     header = read_header(read_bytes(first.image), first.image)
     turned = header.orientation >= 5  # EXIF: the stored picture lies on its side

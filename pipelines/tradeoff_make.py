@@ -56,8 +56,7 @@ def open_ground(folder: Path, settings: Settings, share: float) -> Ground:
     Raises:
         InputError: a stage's file is missing or damaged.
     """
-    from fieldfuse.capture.storage import capture_from_dict
-    from fieldfuse.capture.views_file import load_views
+    from fieldfuse.capture.storage import capture_from_dict, load_views
     from fieldfuse.evaluation.compare_truth import find_truth, true_depths
     from fieldfuse.poses.result import PoseResult
     from fieldfuse.poses.scene import Scene

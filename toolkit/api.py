@@ -54,7 +54,7 @@ def load(
         Interrupted: the listener asked to stop.
     """
     from fieldfuse.capture.photos import with_unposed
-    from fieldfuse.capture.subset import limited
+    from fieldfuse.capture.prepare import limited
     from fieldfuse.effects.correct import Corrections
     from fieldfuse.poses.points import Features
     from fieldfuse.poses.scene import describe_scene

@@ -117,12 +117,12 @@ def needs_frames(capture: Capture) -> bool:
 
 def write_frames(capture: Capture, folder: Path, settings: Settings, progress: Progress = SILENT) -> Capture:
     """The capture with images in `folder/frames`: chosen from a video or film, or converted from HEIF and mirrored ones."""
-    from fieldfuse.capture.convert import convert_pictures
+    from fieldfuse.capture.convert import convert_images
     from fieldfuse.capture.select import select_frames
 
     if capture.filmed:
         return select_frames(capture, folder, settings.capture, progress)
-    return convert_pictures(capture, folder, settings.threads or os.cpu_count() or 1, progress)
+    return convert_images(capture, folder, settings.threads or os.cpu_count() or 1, progress)
 
 
 def uses_given_poses(capture: Capture, settings: Settings) -> bool:
@@ -206,7 +206,7 @@ def prepared(
 
 def key_frames(views: Views, scene: Scene, settings: Settings, sharp: bool = True) -> KeyFrames:
     """Key frames among the training views and their neighbours, as indices into the training views; `sharp`: blurred images give way."""
-    from fieldfuse.capture.subset import sharpness
+    from fieldfuse.capture.select import sharpness
     from fieldfuse.nerfusion.keyframes import KeyFrames, select_keyframes
 
     train = np.flatnonzero(~np.asarray(views.test))

@@ -56,7 +56,12 @@ FAULTS = (
         ("(quaternion / length)[[1, 2, 3, 0]]", "(quaternion / length)[[0, 1, 2, 3]]"),
         ("w, x, y, z = quaternion / length", "x, y, z, w = quaternion / length"),
     ),
-    fault("TUM depth with Kinect's unit", "wrong unit", ("DEPTH_SCALE = 5000.0", "DEPTH_SCALE = 1000.0")),
+    fault(
+        "TUM depth with Kinect's unit",
+        "wrong unit",
+        ("DEPTH_SCALE = 5000.0", "DEPTH_SCALE = 1000.0"),
+        ("depth_scale=5000.0", "depth_scale=1000.0"),
+    ),
     fault(
         "DTU projection's sign test",
         "wrong comparison",
@@ -66,6 +71,7 @@ FAULTS = (
         "depth unit without the applied scale",
         "skipped step",
         ("return 1.0 / (factor * applied_scale)", "return 1.0 / factor"),
+        ("or 1e-3) * (applied_scale or 1.0)", "or 1e-3)"),
     ),
     fault(
         "farther surface wins where depth is carried over",
@@ -78,7 +84,12 @@ FAULTS = (
         ("if not resolved.is_relative_to(root) and Path(os.path.normpath(root / relative)).is_relative_to(root):", "if False:"),
     ),
     fault("size of text files", "dropped guard", ("if path.stat().st_size > max_bytes:", "if False:")),
-    fault("EXIF orientation 5 to 8 not transposed", "skipped step", ("picture = picture.swapaxes(0, 1)", "picture = picture[:, :]")),
+    fault(
+        "EXIF orientation 5 to 8 not transposed",
+        "skipped step",
+        ("picture = picture.swapaxes(0, 1)", "picture = picture[:, :]"),
+        ("image = image.swapaxes(0, 1)", "image = image[:, :]"),
+    ),
     fault(
         "focal length of a camera angle",
         "wrong constant",
@@ -87,7 +98,7 @@ FAULTS = (
     fault(
         "frames chosen for blur",
         "wrong comparison",
-        ("if kept is None or score[index] > score[kept]:", "if kept is None or score[index] < score[kept]:"),
+        ("is None or score[index] > score[", "is None or score[index] < score["),
     ),
     # Poses
     fault("scale of a sensor not applied to poses", "skipped step", ("poses[:, :3, 3] *= scale", "poses[:, :3, 3] *= 1.0")),

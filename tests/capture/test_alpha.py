@@ -1,4 +1,4 @@
-"""Alpha cuts an object out in every layout whose pictures can hold it, and full alpha says nothing."""
+"""Alpha cuts an object out in every layout whose images can hold it, and full alpha says nothing."""
 
 from __future__ import annotations
 
@@ -95,7 +95,7 @@ def test_one_of_many_with_alpha_and_files_that_are_damaged(tmp_path: Path) -> No
         path = tmp_path / f"{index}.png"
         assert cv2.imwrite(str(path), texture(12, 16, seed=index))
         frames.append(Frame(path.stem, path))
-    frames[2].image.write_bytes(b"no picture")
+    frames[2].image.write_bytes(b"no image")
     frames[3].image.unlink()
     assert not cut_out(frames) and not cut_out([])
     with_alpha(frames[13].image, 0)

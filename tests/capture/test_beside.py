@@ -12,9 +12,8 @@ from PIL import Image
 
 from fieldfuse.camera import Array
 from fieldfuse.capture import Capture, open_capture
-from fieldfuse.capture.beside import unused
 from fieldfuse.capture.checks import check_capture
-from fieldfuse.capture.duplicates import copies
+from fieldfuse.capture.photos import unused
 from fieldfuse.errors import InputError
 from tests.capture.films import film, quarters
 from tests.capture.layouts import write_colmap_bin, write_transforms
@@ -124,19 +123,26 @@ def test_photos_that_are_there_twice_count_once(tmp_path: Path) -> None:
     capture = check_capture(open_capture(tmp_path))
     assert [frame.name for frame in capture.frames] == [f"IMG_{index}" for index in range(6)]
     assert sum(capture.extra["sizes"].values()) == 6
-    assert [warning for warning in capture.warnings if "7 pictures are copies of others (" in warning and "count once" in warning]
+    assert [warning for warning in capture.warnings if "7 images are copies of others (" in warning and "count once" in warning]
 
 
 def test_neighbours_are_no_copies_and_posed_copies_are_said(tmp_path: Path) -> None:
-    tiny = [cv2.resize(cv2.cvtColor(scene(index), cv2.COLOR_RGB2GRAY).astype(np.float32), (48, 48)) for index in range(5)]
-    names = [str(index) for index in range(5)]
-    assert copies(tiny, [1] * 5, names) == {}
-    faint = [128 + (one - one.mean()) / 40 for one in tiny]  # a dark room: its views differ by as little as they show
-    assert copies(faint, [1] * 5, names) == {}
-    assert copies([*tiny, tiny[3] + 0.5], [*[1] * 5, 9], [*names, "copy"]) == {3: 5}, "the larger one stays"
+    shoot(tmp_path / "photos", [f"{index}.png" for index in range(5)])
+    faint = tmp_path / "faint"  # a dark room: its views differ by as little as they show
+    faint.mkdir()
+    for index in range(5):
+        Image.fromarray((128 + (scene(index).astype(float) - 128) / 20).round().astype(np.uint8)).save(faint / f"{index}.png")
+    for folder in (tmp_path / "photos", faint):
+        assert len(check_capture(open_capture(folder)).frames) == 5
+    Image.fromarray(scene(3)).resize((320, 240)).save(tmp_path / "photos" / "copied.png")
+    shutil.copy(tmp_path / "photos" / "2.png", tmp_path / "photos" / "00.png")
+    left = {frame.image.name for frame in check_capture(open_capture(tmp_path / "photos")).frames}
+    assert left == {"00.png", "0.png", "1.png", "4.png", "copied.png"}, "the larger one stays, and one of two equal ones"
+    shutil.rmtree(tmp_path / "photos")
+    shutil.rmtree(faint)
     write_transforms(tmp_path)
     frames = open_capture(tmp_path).frames
     shutil.copy(frames[0].image, frames[1].image)
     capture = check_capture(open_capture(tmp_path))
     assert len(capture.frames) == len(frames)
-    assert any("1 picture is a copy of others (0001.png of 0000.png); where the one is held out" in warning for warning in capture.warnings)
+    assert any("1 image is a copy of others (0001.png of 0000.png); where the one is held out" in warning for warning in capture.warnings)

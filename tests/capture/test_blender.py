@@ -5,7 +5,6 @@ from __future__ import annotations
 import json
 from pathlib import Path
 
-import cv2
 import pytest
 
 from fieldfuse.capture import open_capture
@@ -49,34 +48,12 @@ def test_images_in_both_splits_are_held_out(tmp_path: Path) -> None:
     assert {frame.split for frame in read_blender(tmp_path).frames} == {None}, "no split at all: every eighth is held out"
 
 
-def test_paths_of_another_machine(tmp_path: Path) -> None:
-    """Splits hold images of the same names, and one that is gone is not taken for the other split's."""
-    write_blender(tmp_path)
-    for split in ("train", "test"):
-        data = json.loads((tmp_path / f"transforms_{split}.json").read_text())
-        for frame in data["frames"]:
-            frame["file_path"] = "D:\\data\\made\\" + frame["file_path"].removeprefix("./").replace("/", "\\")
-        (tmp_path / f"transforms_{split}.json").write_text(json.dumps(data))
-    (tmp_path / "test/r_0.png").unlink()
-    capture = read_blender(tmp_path)
-    assert len(capture.frames) == 4
-    assert {(frame.image.parent.name, frame.split) for frame in capture.frames} == {("train", "train"), ("test", "test")}
-    assert "of another machine" in capture.warnings[0]
-
-
-def test_opaque_pictures_have_no_alpha(tmp_path: Path) -> None:
-    write_blender(tmp_path)
-    for frame in read_blender(tmp_path).frames:
-        cv2.imwrite(str(frame.image), cv2.imread(str(frame.image)))
-    assert not read_blender(tmp_path).alpha
-
-
 def test_missing_pictures_are_counted(tmp_path: Path) -> None:
     write_blender(tmp_path)
     read_blender(tmp_path).frames[0].image.unlink()
     capture = read_blender(tmp_path)
     assert capture.extra == {"listed": 5, "missing": 1}
-    assert capture.warnings == ("1 of the 5 listed pictures do not exist; the other 4 are used",)
+    assert capture.warnings == ("1 of the 5 listed images do not exist; the other 4 are used",)
     for frame in capture.frames:
         frame.image.unlink()
     with pytest.raises(InputError, match="none of the 5 images"):

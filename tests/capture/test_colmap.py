@@ -12,8 +12,7 @@ import pytest
 
 from fieldfuse.camera import Intrinsics, project
 from fieldfuse.capture import open_capture
-from fieldfuse.capture.colmap import candidate_captures, read_colmap
-from fieldfuse.capture.colmap_model import MODELS, intrinsics_of, read_model
+from fieldfuse.capture.colmap import MODELS, candidate_capture, candidate_models, intrinsics_of, read_colmap, read_model
 from fieldfuse.errors import InputError
 from tests.capture.layouts import OFF_CENTRE, POINTS, half_size, write_colmap_bin, write_colmap_txt
 from tests.capture.made import eyes, pixel_error, render, save_picture
@@ -48,7 +47,7 @@ def test_each_camera_model_projects_like_pycolmap(model: str) -> None:
 
 def test_model_numbers_and_parameter_counts_are_pycolmaps() -> None:
     pycolmap = pytest.importorskip("pycolmap")
-    for number, name, count in MODELS:
+    for number, (name, count, _) in enumerate(MODELS):
         if name in pycolmap.CameraModelId.__members__:
             assert int(pycolmap.CameraModelId.__members__[name]) == number
             assert len(pycolmap.Camera(model=name, width=80, height=60, params=[1.0] * count).params) == count
@@ -87,7 +86,7 @@ def test_places_of_the_model(tmp_path: Path, place: str) -> None:
     capture = open_capture(tmp_path)
     assert (capture.kind, len(capture.frames)) == ("colmap", 5)
     if place != ".":
-        assert len(read_colmap(tmp_path / place).frames) == 5, "the model's own folder, pictures above it"
+        assert len(read_colmap(tmp_path / place).frames) == 5, "the model's own folder, images above it"
 
 
 def test_pictures_beside_the_model(tmp_path: Path) -> None:
@@ -186,7 +185,7 @@ def test_a_link_among_names_with_spaces_leads_nowhere_else(tmp_path: Path) -> No
 
 
 def test_a_principal_point_far_outside_is_refused(tmp_path: Path) -> None:
-    """Just beside it is well: pictures are cropped."""
+    """Just beside it is well: images are cropped."""
     write_colmap_txt(tmp_path)
     path = tmp_path / "sparse/0/cameras.txt"
     path.write_text("7 PINHOLE 80 60 71 73 100 27.5\n")
@@ -242,7 +241,7 @@ def test_the_model_is_taken_whose_sizes_fit(tmp_path: Path) -> None:
     move(tmp_path, ("images", "dense/0/images"))
     shutil.copytree(tmp_path / "sparse/0", tmp_path / "dense/0/sparse")
     (tmp_path / "sparse/0/cameras.txt").write_text("7 PINHOLE 400 300 500 500 200 150\n")  # of the same shape
-    captures = list(candidate_captures(tmp_path))
+    captures = [candidate_capture(tmp_path, candidate) for candidate in candidate_models(tmp_path)]
     assert pixel_error(captures[0], eyes(), OFF_CENTRE) < 1e-3
     assert "dense/0/sparse is used" in captures[0].warnings[0]
     assert "not used: sparse/0 (5 images, 5 of which fit)" in captures[0].warnings[0]
@@ -270,7 +269,7 @@ def test_every_truncation_and_every_huge_count_is_refused(tmp_path: Path, name: 
             read_model(path.parent)
     for count in (len(whole), 2**40, 2**64 - 1):
         path.write_bytes(struct.pack("<Q", count) + whole[8:])
-        with pytest.raises(InputError, match="ends before its own counts say"):
+        with pytest.raises(InputError, match="ends before its own counts"):
             read_model(path.parent)
 
 

@@ -15,10 +15,9 @@ from hypothesis import strategies as st
 from PIL import Image, ImageCms
 
 from fieldfuse.camera import Array
-from fieldfuse.capture.colours import MOST_BYTES, SAME, to_srgb
-from fieldfuse.capture.convert import write_picture
+from fieldfuse.capture.colours import MOST_BYTES, png_colours, profile_of, to_srgb
+from fieldfuse.capture.convert import write_image
 from fieldfuse.capture.images import load_image, load_mask
-from fieldfuse.capture.primaries import png_colours, profile_of
 from fieldfuse.capture.types import Frame
 from tests.capture.board import texture
 
@@ -112,11 +111,6 @@ def test_alpha_is_left_alone() -> None:
     np.testing.assert_array_equal(got[..., :3], to_srgb(np.ascontiguousarray(picture[..., :3]), profile(P3)))
 
 
-def test_greys_stay_grey() -> None:
-    greys = np.repeat(np.arange(256, dtype=np.uint8)[:, None, None], 3, axis=2)
-    assert np.abs(to_srgb(greys, profile(P3)).astype(int) - greys).max() <= SAME
-
-
 @given(st.binary(max_size=400), st.integers(0, 600), st.booleans())
 @settings(max_examples=60, deadline=None)
 def test_damaged_profiles_change_nothing_and_stop_nothing(noise: bytes, at: int, cut: bool) -> None:
@@ -157,7 +151,7 @@ def test_a_heif_photo_is_read_and_converted_as_srgb(tmp_path: Path) -> None:
     wanted = expected(picture, P3)
     inner = np.abs(wanted - picture).max(axis=2) > 0
     inner[:, 40:56] = False  # codecs blur an edge
-    written = write_picture(path, tmp_path / "written")
+    written = write_image(path, tmp_path / "written")
     with Image.open(written) as jpeg:
         assert jpeg.info.get("icc_profile") is None
     for got in (load_image(Frame("a", path)), load_image(Frame("a", written))):
@@ -206,15 +200,6 @@ def test_a_heif_photo_that_says_its_colours_by_number(tmp_path: Path, number: in
     Image.fromarray(picture).save(path, format="HEIF", quality=95, **codes, **more)
     wanted = expected(picture, P3 if number == 12 and not icc else SRGB)
     assert np.abs(load_image(Frame("a", path)) - wanted).mean() < 2
-
-
-def test_profiles_by_number_are_those_of_their_primaries() -> None:
-    picture = colours()
-    for number, primaries in ((9, BT2020), (12, P3)):
-        told = profile_of(number, 13)
-        assert told is not None and np.abs(to_srgb(picture, told) - expected(picture, primaries)).max() <= 2
-        assert np.abs(to_srgb(picture, told).astype(int) - to_srgb(picture, profile(primaries))).max() <= SAME
-    assert profile_of(1, 13) is None and profile_of(12, 18) is None and profile_of(2, 2) is None
 
 
 def test_grey_photos_with_a_profile_and_masks_stay_as_they_are(tmp_path: Path) -> None:

@@ -1,4 +1,4 @@
-"""Every layout is told apart, and its cameras are the true ones: by exact projection, and by reprojecting what the pictures show."""
+"""Every layout is told apart, and its cameras are the true ones: by exact projection, and by reprojecting what the images show."""
 
 from __future__ import annotations
 
@@ -11,11 +11,11 @@ import pytest
 
 from fieldfuse.camera import Intrinsics
 from fieldfuse.capture import open_capture
+from fieldfuse.capture.calibration import fitted
 from fieldfuse.capture.checks import check_capture
 from fieldfuse.capture.detect import READERS, detect_kind
 from fieldfuse.capture.images import load_image
 from fieldfuse.capture.listing import natural_key, unique_names
-from fieldfuse.capture.sizes import fitted
 from fieldfuse.errors import InputError
 from tests.capture.films import film
 from tests.capture.layouts import (
@@ -82,7 +82,7 @@ def test_what_is_written_on_purpose_goes_before_what_is_left_behind(tmp_path: Pa
     write_colmap_bin(tmp_path)
     assert detect_kind(tmp_path) == "colmap"
     write_llff(tmp_path)
-    assert detect_kind(tmp_path) == "colmap", "the model has lens and points, and its pictures are there"
+    assert detect_kind(tmp_path) == "colmap", "the model has lens and points, and its images are there"
     for picture in (tmp_path / "images").iterdir():
         picture.unlink()
     assert detect_kind(tmp_path) == "llff"
@@ -156,7 +156,7 @@ def test_one_picture_beside_a_video_is_its_cover(tmp_path: Path) -> None:
     save_picture(tmp_path / "cover.jpg", render(eyes()[0], EIGHTH_525)[0])
     capture = check_capture(open_capture(tmp_path))
     assert (capture.kind, len(capture.frames)) == ("video", 5)
-    assert capture.warnings == ("the video clip.mp4 is used; the one picture beside it, cover.jpg, is left out",)
+    assert capture.warnings == ("the video clip.mp4 is used; the one image beside it, cover.jpg, is left out",)
     (tmp_path / "second.mp4").write_bytes((tmp_path / "clip.mp4").read_bytes())
     with pytest.raises(InputError, match="2 videos"):
         open_capture(tmp_path)
@@ -168,7 +168,7 @@ def test_one_picture_beside_a_video_is_its_cover(tmp_path: Path) -> None:
 def test_one_picture_is_no_capture(tmp_path: Path, name: str) -> None:
     save_picture(tmp_path / "one.jpg", render(eyes()[0], EIGHTH_525)[0])
     (tmp_path / "one.jpg").rename(tmp_path / name)
-    with pytest.raises(InputError, match=rf"{name} is one picture, .*; give the folder"):
+    with pytest.raises(InputError, match=rf"{name} is one image, .*; give the folder"):
         open_capture(tmp_path / name)
 
 
@@ -186,7 +186,7 @@ def test_nothing_there_is_said_in_one_sentence(tmp_path: Path) -> None:
 def test_a_file_that_is_no_picture_is_named(tmp_path: Path, layout: str) -> None:
     LAYOUTS[layout][1](tmp_path)
     victim = open_capture(tmp_path).frames[-1].image
-    victim.write_bytes(b"not a picture")
+    victim.write_bytes(b"not an image")
     try:
         said = " ".join(check_capture(open_capture(tmp_path)).warnings)  # one of many is left out
     except InputError as error:

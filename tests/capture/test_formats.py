@@ -13,12 +13,11 @@ from PIL import Image, TiffImagePlugin
 
 from fieldfuse.camera import Array
 from fieldfuse.capture import open_capture
+from fieldfuse.capture.archive import read_bytes
 from fieldfuse.capture.checks import check_capture
-from fieldfuse.capture.headers import orientation_of, read_bytes, read_header
-from fieldfuse.capture.images import load_image, read_picture, turns_by_exif
-from fieldfuse.capture.sizes import picture_header
+from fieldfuse.capture.headers import image_header, orientation_of, read_header, read_tiff, unturned
+from fieldfuse.capture.images import load_image, read_image, turns_by_exif
 from fieldfuse.capture.storage import capture_from_dict, capture_to_dict
-from fieldfuse.capture.tiff import read_tiff, unturned
 from fieldfuse.capture.types import Frame
 from fieldfuse.errors import InputError
 from tests.pipelines.made import make_room
@@ -52,14 +51,14 @@ def test_a_damaged_avif_is_refused_by_name(tmp_path: Path) -> None:
     path = tmp_path / "a" / "02.avif"
     path.write_bytes(path.read_bytes()[:-200])
     with pytest.raises(InputError, match=r"02\.avif is cut short"):
-        read_picture(path)
+        read_image(path)
 
 
 def test_floating_point_tiff_is_taken_as_0_to_1(tmp_path: Path) -> None:
     for number, path in enumerate(photos(tmp_path / "f", ".tif")):
         cv2.imwrite(str(path), scene(3 * number)[..., ::-1].astype(np.float32) / 255)
     capture = check_capture(open_capture(tmp_path / "f"))
-    assert picture_header(capture.frames[0].image).size == (WIDTH, HEIGHT)
+    assert image_header(capture.frames[0].image).size == (WIDTH, HEIGHT)
     assert np.array_equal(load_image(capture.frames[0]), scene())
 
 
@@ -125,11 +124,11 @@ def test_a_turned_tiff_is_turned_once_as_a_photo_and_never_beside_poses(orientat
     }[orientation]
     path = tmp_path / "a.tif"
     turned_tiff(path, np.ascontiguousarray(stored), orientation)
-    got, said = read_picture(path)
+    got, said = read_image(path)
     assert said == orientation == orientation_of(path)
     assert np.array_equal(got, stored)
     header = read_header(read_bytes(path), path)
-    assert (header.width, header.height) == picture_header(path).size == (stored.shape[1], stored.shape[0])
+    assert (header.width, header.height) == image_header(path).size == (stored.shape[1], stored.shape[0])
     frame = Frame("a", path)
     assert np.array_equal(load_image(frame, exif=True), upright)
     assert np.array_equal(load_image(frame), stored)

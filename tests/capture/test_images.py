@@ -150,12 +150,6 @@ def test_a_truncated_jpeg_is_told_from_a_whole_one(tmp_path: Path, progressive: 
             load_image(frame(path))
 
 
-@given(st.binary(max_size=400))
-def test_arbitrary_bytes_give_a_clear_refusal(data: bytes) -> None:
-    with pytest.raises(InputError, match=r"x\.jpg"):
-        read_header(b"\xff\xd8" + data, Path("x.jpg"))
-
-
 @given(st.integers(0, 2000), st.integers(0, 255))
 def test_a_changed_byte_in_the_header_never_ends_in_a_traceback(position: int, value: int) -> None:
     data = bytearray(jpeg(thumbnail=True))
@@ -169,8 +163,8 @@ def test_a_changed_byte_in_the_header_never_ends_in_a_traceback(position: int, v
 
 def test_missing_empty_and_foreign_files(tmp_path: Path) -> None:
     (tmp_path / "empty.png").write_bytes(b"")
-    (tmp_path / "text.png").write_text("no picture")
-    for name, text in (("missing.png", "cannot read"), ("empty.png", "empty"), ("text.png", "not a picture")):
+    (tmp_path / "text.png").write_text("no image")
+    for name, text in (("missing.png", "cannot read"), ("empty.png", "empty"), ("text.png", "not an image")):
         with pytest.raises(InputError, match=rf"{text}|{name}.*{text}"):
             load_image(frame(tmp_path / name))
 

@@ -12,11 +12,10 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from fieldfuse.camera import FISHEYE, OPENCV, Intrinsics, Similarity, undistort_maps
-from fieldfuse.capture.prepare import held_out, pictures_at, prepare_views, target_size
+from fieldfuse.capture.prepare import held_out, images_at, prepare_views, target_size
 from fieldfuse.capture.types import Frame, Views
 from fieldfuse.config import CaptureSettings
-from fieldfuse.errors import InputError, Interrupted
-from fieldfuse.progress import Progress
+from fieldfuse.errors import InputError
 from tests.capture.board import capture_of, corners, found_corners, photograph, posed, save, texture
 
 PLAIN = Intrinsics(480, 360, 400.0, 396.0, 236.5, 183.25)
@@ -57,11 +56,11 @@ def test_pictures_in_another_size_are_those_that_views_of_it_have(tmp_path: Path
     frames = [posed(save(tmp_path / f"{name}.png", photograph(camera)), camera) for name, camera in (("a", PLAIN), ("b", BARREL))]
     capture = capture_of(tmp_path, frames)
     views = prepare_views(capture, SAME, CaptureSettings(image_size=size))
-    for index, (camera, picture) in zip((1, 0), pictures_at(capture, [1, 0], size), strict=True):
+    for index, (camera, picture) in zip((1, 0), images_at(capture, [1, 0], size), strict=True):
         assert camera == views.intrinsics[index]
         np.testing.assert_array_equal(picture, views.images[index])
     with pytest.raises(InputError, match="no intrinsics; find poses first"):
-        next(pictures_at(capture_of(tmp_path, [replace(frames[0], intrinsics=None)]), [0], size))
+        next(images_at(capture_of(tmp_path, [replace(frames[0], intrinsics=None)]), [0], size))
 
 
 def test_a_lens_is_removed_exactly_once(tmp_path: Path) -> None:
@@ -122,14 +121,6 @@ def test_pictures_are_never_enlarged_and_keep_their_shape(width: int, height: in
     assert abs(w * height - h * width) <= 0.5 * max(width, height) + max(width, height) * (min(w, h) == 1)
 
 
-@pytest.mark.parametrize(("own", "expected"), [((900, 600), (640, 427)), ((300, 500), (300, 500))])
-def test_default_size(tmp_path: Path, own: tuple[int, int], expected: tuple[int, int]) -> None:
-    camera = Intrinsics(*own, 500.0, 500.0, own[0] / 2, own[1] / 2)
-    views = one_view(tmp_path, camera, texture(own[1], own[0]))
-    assert (views.intrinsics[0].width, views.intrinsics[0].height) == expected
-    assert views.intrinsics[0].fx == pytest.approx(500 * expected[0] / own[0])
-
-
 def test_a_camera_for_another_size_of_the_same_picture_is_scaled(tmp_path: Path) -> None:
     views = one_view(tmp_path, PLAIN, texture(180, 240))
     assert views.intrinsics[0] == PLAIN.scaled(240, 180)
@@ -156,16 +147,6 @@ def test_a_frame_without_pose_is_refused(tmp_path: Path) -> None:
     frame = Frame("a", save(tmp_path / "a.png", texture(36, 48)), intrinsics=PLAIN)
     with pytest.raises(InputError, match="no pose"):
         prepare_views(capture_of(tmp_path, [frame]), SAME, CaptureSettings())
-
-
-def test_stopping_is_heard(tmp_path: Path) -> None:
-    class Stop(Progress):
-        def stopping(self) -> bool:
-            return True
-
-    frame = posed(save(tmp_path / "a.png", texture(36, 48)), PLAIN)
-    with pytest.raises(Interrupted):
-        prepare_views(capture_of(tmp_path, [frame]), SAME, CaptureSettings(), Stop())
 
 
 def test_photos_are_turned_by_exif_and_other_kinds_are_not(tmp_path: Path) -> None:
@@ -233,14 +214,6 @@ def test_alpha_is_composited_on_white_before_resampling(tmp_path: Path, camera: 
     assert np.abs(image[45, 5] - [127, 127, 227]).max() <= 2 and abs(int(alpha[45, 5]) - 128) <= 1
     edge = image[45, 55:65]
     assert (edge[:, 0] >= 195).all()  # red only runs between white and the object's own
-
-
-def test_alpha_is_ignored_where_the_capture_does_not_use_it(tmp_path: Path) -> None:
-    picture = np.dstack([texture(36, 48), np.full((36, 48), 7, np.uint8)])
-    frame = posed(save(tmp_path / "a.png", picture), PLAIN)
-    views = prepare_views(capture_of(tmp_path, [frame], alpha=False), SAME, CaptureSettings())
-    np.testing.assert_array_equal(views.images[0], picture[..., :3])
-    assert views.alpha == [None] and views.background is None
 
 
 @pytest.mark.parametrize("mask_size", [(360, 480), (180, 240)])

@@ -93,7 +93,7 @@ def test_the_crop_of_the_small_dtu_pictures_is_the_right_one() -> None:
 
     assert distance(0) < 0.15
     assert min(distance(-4), distance(4)) > 2 * distance(0)
-    assert distance(200 * 0.32) > 20 * distance(0), "the principal point of the uncropped picture"
+    assert distance(200 * 0.32) > 20 * distance(0), "the principal point of the uncropped image"
 
 
 def stored_depth(capture: Capture, frame: Frame) -> Array:

@@ -118,18 +118,18 @@ HOSTILE = {
     "version 3": (lambda data: packed(data, 0, "<I", 3), "is one of version 3;"),
     "a name of 2^60 letters": (lambda data: packed(data, 4, "<Q", 2**60), "is no .sens file"),
     "ends in the header": (lambda data: bytes(data[: HEAD + 70]), "ends within its header"),
-    "pictures of no known coding": (lambda data: packed(data, HEAD + 256, "<i", -1), "pictures packed in way -1"),
-    "depth of a maker's coding": (lambda data: packed(data, HEAD + 260, "<i", 2), "depth packed in way 2, .*export color/"),
+    "images of no known coding": (lambda data: packed(data, HEAD + 256, "<i", -1), "images in coding -1"),
+    "depth of a maker's coding": (lambda data: packed(data, HEAD + 260, "<i", 2), "depth in coding 2, .*export color/"),
     "a billion pixels": (lambda data: packed(data, HEAD + 264, "<2I", 2**16, 2**14), "65536×16384 pixels"),
-    "pictures of another shape": (lambda data: packed(data, HEAD + 264, "<2I", 96, 60), "frame 0: the picture is 96×72 but .* 96×60"),
+    "images of another shape": (lambda data: packed(data, HEAD + 264, "<2I", 96, 60), "frame 0: the image is 96×72 but .* 96×60"),
     "no width": (lambda data: packed(data, HEAD + 272, "<I", 0), "0×60 pixels"),
     "no unit of depth": (lambda data: packed(data, HEAD + 280, "<f", 0), "0 for each metre"),
     "2^60 frames": (lambda data: packed(data, HEAD + 284, "<Q", 2**60), f"announces {2**60} frames"),
     "two frames more": (lambda data: packed(data, HEAD + 284, "<Q", 8), "ends within frame 7 of 8"),
-    "a picture of 2^63 bytes": (lambda data: packed(data, BODY + 80, "<Q", 2**63), "ends within frame 0 of 6"),
-    "ends in a picture": (lambda data: bytes(data[: BODY + 500]), "ends within frame 0|bytes can hold"),
+    "an image of 2^63 bytes": (lambda data: packed(data, BODY + 80, "<Q", 2**63), "ends within frame 0 of 6"),
+    "ends in an image": (lambda data: bytes(data[: BODY + 500]), "ends within frame 0|bytes can hold"),
     "no focal length": (lambda data: packed(data, HEAD, "<f", 0), "the colour camera"),
-    "no frame": (lambda data: packed(data, HEAD + 284, "<Q", 0), "holds no picture"),
+    "no frame": (lambda data: packed(data, HEAD + 284, "<Q", 0), "holds no image"),
 }
 
 
@@ -150,7 +150,7 @@ def test_a_pose_that_is_not_a_number_costs_its_frame(tmp_path: Path) -> None:
     assert len(capture.frames) == frames - 1 and any("tracking was lost" in warning for warning in capture.warnings)
 
 
-@pytest.mark.parametrize("bytes_of", ["picture", "depth"])
+@pytest.mark.parametrize("bytes_of", ["image", "depth"])
 def test_what_is_damaged_inside_is_told_by_its_frame(tmp_path: Path, bytes_of: str) -> None:
     data = made(tmp_path / NAME)
     begin, picture, _ = scan(tmp_path / NAME).places[1].tolist()
@@ -159,7 +159,7 @@ def test_what_is_damaged_inside_is_told_by_its_frame(tmp_path: Path, bytes_of: s
     (tmp_path / NAME).write_bytes(data)
     capture = open_capture(tmp_path)
     with pytest.raises(InputError, match=f"the {bytes_of} of frame 1 in .*{NAME} is damaged"):
-        load_image(capture.frames[1]) if bytes_of == "picture" else load_depth(capture.frames[1], capture)
+        load_image(capture.frames[1]) if bytes_of == "image" else load_depth(capture.frames[1], capture)
     (tmp_path / NAME).unlink()
     with pytest.raises(InputError, match="cannot read"):
         load_image(capture.frames[0])
@@ -190,7 +190,7 @@ def test_frames_without_picture_or_depth(tmp_path: Path) -> None:
     (tmp_path / "a.sens").write_bytes(sens_of(frames))
     capture = open_capture(tmp_path)
     assert [frame.name for frame in capture.frames] == ["0", "2"] and not capture.has_depth
-    assert capture.warnings == ("1 frame of a.sens left out because no picture belongs to it",)
+    assert capture.warnings == ("1 frame of a.sens left out because no image belongs to it",)
 
 
 def test_a_depth_camera_beside_the_pictures_is_told(tmp_path: Path) -> None:

@@ -12,7 +12,7 @@ from fieldfuse.capture.images import load_depth
 from fieldfuse.capture.seven_scenes import read_seven_scenes
 from fieldfuse.errors import InputError
 from tests.capture.layouts import EIGHTH_585, rows, write_seven_scenes
-from tests.capture.made import Pinhole, eyes, left_out, pixel_error, render, save_depth, save_picture
+from tests.capture.made import Pinhole, eyes, pixel_error, render, save_depth, save_picture
 from tests.conftest import shared_data
 
 
@@ -113,10 +113,10 @@ def test_bundlefusion_tells_its_cameras_in_a_file_of_its_own(tmp_path: Path) -> 
 @pytest.mark.parametrize(
     ("old", "new", "message"),
     [
-        ("583 0 320", "583 320", "must hold 16 finite numbers"),
+        ("583 0 320", "583 320", "must hold 16 numbers"),
         ("583 0 320", "-583 0 320", "must be positive"),
         ("583 0 320", "583 0 1320", "outside the 640×480 picture"),
-        ("m_colorWidth = 640", "m_colorWidth = wide", "must hold 1 finite number;"),
+        ("m_colorWidth = 640", "m_colorWidth = wide", "must hold numbers only;"),
         ("m_colorWidth = 640", "m_colorWidth = 0", "is not usable"),
         ("m_depthShift = 2000", "m_depthShift = 0", "must be positive"),
     ],
@@ -128,37 +128,13 @@ def test_a_broken_file_of_bundlefusion(tmp_path: Path, old: str, new: str, messa
         open_capture(tmp_path)
 
 
-def test_frames_without_depth_are_kept(tmp_path: Path) -> None:
-    write_seven_scenes(tmp_path)
-    (tmp_path / "frame-000002.depth.png").unlink()
-    frames = open_capture(tmp_path).frames
-    assert [frame.depth is None for frame in frames] == [False, False, True, False, False]
-
-
 def test_pictures_and_poses_must_be_as_many(tmp_path: Path) -> None:
     write_seven_scenes(tmp_path)
     (tmp_path / "frame-000002.pose.txt").unlink()
-    with pytest.raises(InputError, match="5 pictures but 4 poses"):
+    with pytest.raises(InputError, match="5 images but 4 poses"):
         open_capture(tmp_path)
     (tmp_path / "frame-000009.pose.txt").write_text(rows(np.eye(4)))
     with pytest.raises(InputError, match=r"no pose file frame-000002\.pose\.txt"):
-        open_capture(tmp_path)
-
-
-@pytest.mark.parametrize(
-    ("pose", "message"),
-    [
-        (np.diag([2.0, 2, 1, 1]), "not rigid"),
-        (np.diag([-1.0, 1, 1, 1]), "mirrors"),
-        (np.eye(3), "4×4 matrix is expected"),
-    ],
-)
-def test_a_bad_pose_names_its_frame(tmp_path: Path, pose: np.ndarray, message: str) -> None:
-    write_seven_scenes(tmp_path)
-    (tmp_path / "frame-000003.pose.txt").write_text(rows(pose))
-    left_out(open_capture(tmp_path), rf"frame-000003\.pose\.txt.*{message}")
-    (tmp_path / "frame-000001.pose.txt").write_text(rows(pose))
-    with pytest.raises(InputError, match=message):
         open_capture(tmp_path)
 
 

@@ -11,7 +11,7 @@ from PIL import Image
 
 from fieldfuse.camera import FISHEYE, OPENCV, PINHOLE, Array, Intrinsics, invert, pixel_grid, project
 from fieldfuse.capture import Capture, open_capture
-from fieldfuse.capture.convert import CONVERTED, convert_pictures, to_convert
+from fieldfuse.capture.convert import CONVERTED, convert_images, to_convert
 from fieldfuse.capture.headers import orientation_of
 from fieldfuse.capture.images import load_image, upright
 from fieldfuse.pipelines.exports import put_cameras
@@ -36,7 +36,7 @@ def photo(path: Path, orientation: int, seed: int = 0) -> Path:
 
 
 def camera_for(orientation: int, lens: str = PINHOLE) -> Intrinsics:
-    """Of the upright picture, with nothing in its middle and no two numbers alike."""
+    """Of the upright image, with nothing in its middle and no two numbers alike."""
     width, height = (HEIGHT, WIDTH) if orientation >= 5 else (WIDTH, HEIGHT)
     return Intrinsics(width, height, 61.0, 67.0, width / 2 + 3.5, height / 2 - 5.25, lens, LENSES[lens])
 
@@ -59,7 +59,7 @@ def found(capture: Capture, cameras: list[Intrinsics]) -> tuple[PoseResult, Capt
 
 
 def stored_places(orientation: int, places: Array) -> Array:
-    """(N, 2) pixels of the upright picture → where the file has them, by turning a picture of the pixels' own places."""
+    """(N, 2) pixels of the upright image → where the file has them, by turning an image of the pixels' own places."""
     grid = upright(pixel_grid(WIDTH, HEIGHT).reshape(HEIGHT, WIDTH, 2), orientation)
     shown = pixel_grid(grid.shape[1], grid.shape[0])
     way = np.linalg.lstsq(np.hstack([shown, np.ones((len(shown), 1))]), grid.reshape(-1, 2), rcond=None)[0]
@@ -106,7 +106,7 @@ def test_mirrored_photos_are_written_upright_into_the_run(tmp_path: Path) -> Non
         photo(tmp_path / "photos" / f"{number}.png", number, seed=number)
     capture = open_capture(tmp_path / "photos")
     assert to_convert(capture) == [0, 1, 2, 3]
-    turned = convert_pictures(capture, tmp_path / "run", 1)
+    turned = convert_images(capture, tmp_path / "run", 1)
     assert turned.extra[CONVERTED] == 4
     for before, after in zip(capture.frames, turned.frames, strict=True):
         assert after.image.parent == tmp_path / "run" / "frames"

@@ -18,7 +18,7 @@ from fieldfuse.capture.video import iterate_video, read_video
 from fieldfuse.config import CaptureSettings, PosesSettings
 from fieldfuse.errors import InputError
 from fieldfuse.poses.job import plan
-from tests.capture.films import film, hide_first, names, quarters, turn
+from tests.capture.films import film, hide_first, quarters, turn
 from tests.capture.layouts import PHONE, write_stray
 from tests.capture.made import eyes, left_out, pixel_error, render
 
@@ -34,7 +34,7 @@ def rewritten(root: Path, change) -> Path:
 
 
 def shown(capture: Capture) -> list[int]:
-    """Which of the true pictures each frame's is, by the difference."""
+    """Which of the true images each frame's is, by the difference."""
     true = [render(eye, PHONE)[0].astype(int) for eye in eyes()]
     return [int(np.argmin([np.abs(load_image(frame).astype(int) - picture).mean() for picture in true])) for frame in capture.frames]
 
@@ -82,7 +82,7 @@ def test_columns_are_found_by_their_names(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("change", "said"),
     [
-        (lambda number, line: line + (NOW if number == 0 else ", 1, nan, 3, 4"), r"odometry\.csv, row 1 holds numbers that are not finite"),
+        (lambda number, line: line + (NOW if number == 0 else ", 1, nan, 3, 4"), r"odometry\.csv, row 1 holds values that are not finite"),
         (lambda number, line: line + (NOW if number == 0 else ", 0, 1, 3, 4"), r"odometry\.csv, row 1: the focal length is 0"),
         (lambda number, line: line if number != 3 else line.rsplit(",", 1)[0], "rows of different length"),
         (lambda number, line: line.replace("qw", "q"), "number"),
@@ -122,14 +122,6 @@ def test_a_first_frame_that_players_leave_out_counts(tmp_path: Path) -> None:
     assert shown(chosen) == [int(frame.name.removeprefix("frame_")) for frame in chosen.frames] and not chosen.warnings
 
 
-def test_frames_chosen_from_what_a_player_shows_are_chosen_again(tmp_path: Path) -> None:
-    write_stray(tmp_path)
-    hide_first(tmp_path / "rgb.mp4")
-    select_frames(read_video(tmp_path / "rgb.mp4"), tmp_path / "run", CaptureSettings(max_frames=10))
-    chosen = select_frames(open_capture(tmp_path), tmp_path / "run", CaptureSettings(max_frames=10))
-    assert shown(chosen) == [int(frame.name.removeprefix("frame_")) for frame in chosen.frames]
-
-
 @pytest.mark.parametrize("before", [None, "threads;1"])
 def test_other_videos_open_as_ever_meanwhile(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, before: str | None) -> None:
     path = hide_first(film(tmp_path / "a.mp4", quarters(6)))
@@ -166,11 +158,6 @@ def test_a_video_that_is_to_be_shown_turned_stays_as_its_matrix_is(tmp_path: Pat
                 (tmp_path / name).rename(tmp_path / f"no_{name}")
     alone = read_video(tmp_path / "rgb.mp4")
     assert (alone.extra["width"] == PHONE.height) == (degrees != 180)  # a video by itself is turned, as ever
-
-
-def test_turned_quarters_as_stored(tmp_path: Path) -> None:
-    path = turn(film(tmp_path / "a.mp4", quarters()), 90)
-    assert names(next(iterate_video(path))[1]) != "rgbk" and names(next(iterate_video(path, as_stored=True))[1]) == "rgbk"
 
 
 @pytest.mark.parametrize("rows", [3, 4])

@@ -1,4 +1,4 @@
-"""Fewer training pictures: evenly spread, and the held-out ones stay the same."""
+"""Fewer training images: evenly spread, and the held-out ones stay the same."""
 
 from __future__ import annotations
 
@@ -8,8 +8,8 @@ import numpy as np
 from hypothesis import given
 from hypothesis import strategies as st
 
-from fieldfuse.capture.prepare import held_out
-from fieldfuse.capture.subset import evenly, limited, sharpness
+from fieldfuse.capture.prepare import evenly, held_out, limited
+from fieldfuse.capture.select import sharpness
 from fieldfuse.capture.types import Capture, Frame
 
 
@@ -41,11 +41,6 @@ def test_places_are_spread_evenly(count: int, some: int) -> None:
     if len(places) > 1:
         assert (places[0], places[-1]) == (0, count - 1)
         assert np.ptp(np.diff(places)) <= 1
-
-
-def test_names_are_ordered_as_people_do() -> None:
-    shuffled = capture(20).with_frames(capture(20).frames[::-1])
-    assert set(names(limited(shuffled, 0, 3), 0, False)) == {"0.png", "10.png", "19.png"}
 
 
 def test_a_blurred_picture_is_less_sharp() -> None:

@@ -88,23 +88,11 @@ def test_lenses(root: Path, fields: dict[str, Any], lens: str, distortion: tuple
 def test_a_pinhole_with_lens_coefficients_is_told(root: Path) -> None:
     edit(root, lambda data: data.update(camera_model="SIMPLE_PINHOLE", k1=0.1))
     assert read_transforms(root).warnings == (
-        "5 pictures with a PINHOLE camera and lens coefficients (k1, …), which are applied as in nerfstudio; "
-        "remove them from the json if the pictures are undistorted already",
+        "5 images with a PINHOLE camera and lens coefficients (k1, …), which are applied as in nerfstudio; "
+        "remove them from the json if the images are undistorted already",
     )
     edit(root, lambda data: data.update(camera_model="OPENCV"))
     assert read_transforms(root).warnings == ()
-
-
-def test_names_without_suffix_and_with_backslashes(root: Path) -> None:
-    edit(root, lambda data: [frame.update(file_path=f".\\images\\{index:04d}") for index, frame in enumerate(data["frames"])])
-    assert [frame.name for frame in read_transforms(root).frames] == ["0000", "0001", "0002", "0003", "0004"]
-
-
-def test_frames_are_sorted_by_name(root: Path) -> None:
-    edit(root, lambda data: data["frames"].reverse())
-    capture = read_transforms(root)
-    assert [frame.name for frame in capture.frames] == ["0000", "0001", "0002", "0003", "0004"]
-    assert pixel_error(capture, eyes(), OFF_CENTRE) < 1e-3
 
 
 def test_listed_files_that_do_not_exist_are_counted(root: Path) -> None:
@@ -113,7 +101,7 @@ def test_listed_files_that_do_not_exist_are_counted(root: Path) -> None:
     capture = read_transforms(root)
     assert len(capture.frames) == 3
     assert capture.extra == {"listed": 5, "missing": 2}
-    assert capture.warnings == ("2 of the 5 listed pictures do not exist; the other 3 are used", "1 listed depth picture not found")
+    assert capture.warnings == ("2 of the 5 listed images do not exist; the other 3 are used", "1 listed depth image not found")
     for path in (root / "images").iterdir():
         path.unlink()
     with pytest.raises(InputError, match="none of the 5 images"):
@@ -136,7 +124,7 @@ def test_smaller_pictures_scale_the_camera_and_say_so(root: Path) -> None:
         save_picture(root / f"images/{index:04d}.png", render(eye, half_size(OFF_CENTRE))[0])
     capture = read_transforms(root)
     assert pixel_error(capture, eyes(), half_size(OFF_CENTRE)) < 1e-3
-    assert capture.warnings == ("5 pictures of another size than the json tells; intrinsics were scaled to fit",)
+    assert capture.warnings == ("5 images of another size than in the json; intrinsics were scaled to fit",)
     assert capture.frames[0].depth_intrinsics.width == 80
 
 
@@ -208,7 +196,7 @@ def test_a_split_that_names_no_frame_is_told(root: Path) -> None:
     capture = read_transforms(root)
     assert [frame.split for frame in capture.frames] == [None, "test", None, None, None], "validation stands in for a missing test"
     assert capture.warnings == tuple(
-        f"'{split}_filenames' of transforms.json names none of its frames and is left out of account" for split in ("train", "test")
+        f"'{split}_filenames' of transforms.json names none of its frames and is ignored" for split in ("train", "test")
     )
 
 
@@ -250,12 +238,12 @@ def first(data: dict) -> dict:
         (lambda d: d.update(cy=-1.0), "outside the 80×60 picture"),
         (lambda d: d.update(cx=0.51, cy=0.49), "shares of the picture's size"),
         (lambda d: (d.pop("w"), d.pop("h"), d.update(cx=2 * 42.25, cy=2 * 27.5)), "2 times as large as the 80×60 one at hand; add 'w'"),
-        (lambda d: (d.pop("w"), d.pop("h"), d.update(cx=4 * 42.25, cy=4 * 27.5)), "a picture 4 times as large"),
-        (lambda d: d.update(w=1e30), "picture size"),
-        (lambda d: d.update(w=-80), "picture size"),
+        (lambda d: (d.pop("w"), d.pop("h"), d.update(cx=4 * 42.25, cy=4 * 27.5)), "an image 4 times as large"),
+        (lambda d: d.update(w=1e30), "image size"),
+        (lambda d: d.update(w=-80), "image size"),
         (lambda d: d.update(w=60, h=80), "another shape"),
         (lambda d: d.update(camera_model="EQUIRECTANGULAR"), "panoramas"),
-        (lambda d: d.update(camera_model="MIRROR_BALL"), "not known"),
+        (lambda d: d.update(camera_model="MIRROR_BALL"), "not supported"),
         (lambda d: d.update(camera_model="OPENCV", k4=0.1), "k4"),
         (lambda d: d.update(applied_scale=0), "'applied_scale'"),
         (lambda d: d.update(applied_transform=[1, 2]), "'applied_transform'"),
@@ -286,7 +274,7 @@ def test_an_image_listed_twice_with_one_pose_counts_once(root: Path) -> None:
     edit(root, lambda data: data["frames"].append({**first(data), "file_path": "./" + first(data)["file_path"]}))
     capture = read_transforms(root)
     assert len(capture.frames) == 5
-    assert capture.warnings == ("1 picture listed once more with the same pose, used once",)
+    assert capture.warnings == ("1 image listed once more with the same pose, used once",)
 
 
 def test_other_names_of_intrinsics(root: Path) -> None:
@@ -298,7 +286,7 @@ def test_other_names_of_intrinsics(root: Path) -> None:
     edit(root, change)
     capture = read_transforms(root)
     assert pixel_error(capture, eyes(), OFF_CENTRE) < 1e-3
-    assert capture.warnings == ("the intrinsics of 5 pictures were read from other keys than 'fl_x', 'fl_y', 'cx', 'cy'",)
+    assert capture.warnings == ("the intrinsics of 5 images were read from other keys than 'fl_x', 'fl_y', 'cx', 'cy'",)
     edit(root, lambda data: [frame.update(f1_x=0.9, f1_y=0.9) for frame in data["frames"]])  # shares, or of something else
     assert read_transforms(root).frames[0].intrinsics.fx == pytest.approx(40 / np.tan(0.5))
 
@@ -371,14 +359,8 @@ def test_hostile_json_is_refused_in_seconds(root: Path, text: str) -> None:
     assert time.process_time() - started < 60  # it takes one where it was measured
 
 
-def test_bytes_that_are_no_text(root: Path) -> None:
-    (root / "transforms.json").write_bytes(b"\xff\xfe\x00{")
-    with pytest.raises(InputError, match="not valid JSON"):
-        open_capture(root)
-
-
 def test_fox_as_it_is_published() -> None:
     capture = open_capture(shared_data("fox_540x960"))
     assert (capture.kind, len(capture.frames), capture.extra) == ("transforms", 50, {"listed": 67, "missing": 17})
     assert capture.frames[0].intrinsics.distortion == (0.0578421, -0.0805099, -0.000980296, 0.00015575)
-    assert capture.warnings == ("17 of the 67 listed pictures do not exist; the other 50 are used",)
+    assert capture.warnings == ("17 of the 67 listed images do not exist; the other 50 are used",)

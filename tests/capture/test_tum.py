@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from pathlib import Path
 
 import numpy as np
@@ -41,12 +40,6 @@ def test_the_folder_tells_the_camera(tmp_path: Path, folder: str, focal: float) 
     assert bool(capture.warnings) == (focal == 525.0)
 
 
-def test_a_camera_file_goes_before_the_name(tmp_path: Path) -> None:
-    write_tum(tmp_path / "fr1")
-    (tmp_path / "fr1/camera_intrinsics.json").write_text(json.dumps({"width": 80, "height": 60, "fx": 60, "fy": 61, "cx": 40, "cy": 30}))
-    assert open_capture(tmp_path / "fr1").frames[0].intrinsics.fx == 60
-
-
 def test_pictures_far_from_any_pose_or_without_file_are_counted(tmp_path: Path) -> None:
     write_tum(tmp_path)
     with (tmp_path / "rgb.txt").open("a") as stream:
@@ -80,7 +73,7 @@ def test_without_depth(tmp_path: Path) -> None:
         ("rgb.txt", "soon rgb/a.png\n", "line 1"),
         ("rgb.txt", "1000.0\n", "line 1"),
         ("rgb.txt", "1000.0 ../../etc/passwd\n", "outside the capture folder"),
-        ("rgb.txt", "5.0 rgb/1000.000000.png\n", "none of the 1 picture"),
+        ("rgb.txt", "5.0 rgb/1000.000000.png\n", "none of the 1 image"),
         ("groundtruth.txt", "1000.0 0 0 0 0 0 0 0\n", "not a rotation"),
         ("groundtruth.txt", "1000.0 0 0 0 nan 0 0 1\n", "not a rotation"),
         ("groundtruth.txt", "1000.0 inf 0 0 0 0 0 1\n", "not finite"),
@@ -100,4 +93,4 @@ def test_depth_listed_outside_the_folder_is_not_read(tmp_path: Path) -> None:
     (tmp_path / "depth.txt").write_text("1000.0 /etc/passwd\n")
     capture = read_tum(tmp_path)
     assert not capture.has_depth
-    assert "1 listed depth picture not found" in capture.warnings
+    assert "1 listed depth image not found" in capture.warnings

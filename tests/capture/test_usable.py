@@ -94,7 +94,7 @@ def test_no_uniform_scale_is_too_small(scale: float, room: Path) -> None:
         return pose
 
     capture = open_capture(changed(room, *range(COUNT), by=scaled))
-    assert capture.warnings == (f"the rotations of 10 poses were scaled by {scale:.4g}, which was taken out",)
+    assert capture.warnings == (f"the rotations of 10 poses were scaled by {scale:.4g}, which was removed",)
 
 
 def test_outside_of_readers_poses_are_checked_as_strictly_as_before() -> None:

@@ -104,12 +104,6 @@ def test_not_a_video(tmp_path: Path, content: bytes, text: str) -> None:
         read_video(path)
 
 
-def test_missing_file_and_folder(tmp_path: Path) -> None:
-    for path in (tmp_path / "no.mp4", tmp_path):
-        with pytest.raises(InputError, match="there is no video"):
-            read_video(path)
-
-
 def test_nothing_is_said_on_stderr(tmp_path: Path) -> None:
     """In a process of its own: decoders write to the file descriptor, and their level is set when the first video is opened."""
     good = film(tmp_path / "good.mp4", quarters(8))

@@ -12,8 +12,8 @@ from safetensors.numpy import load_file, save_file
 
 from fieldfuse.camera import OPENCV, Intrinsics, Similarity
 from fieldfuse.capture.prepare import prepare_views
+from fieldfuse.capture.storage import load_views, save_views
 from fieldfuse.capture.types import Views
-from fieldfuse.capture.views_file import load_views, save_views
 from fieldfuse.config import CaptureSettings
 from fieldfuse.errors import InputError, OutputError
 from fieldfuse.tone import Tone

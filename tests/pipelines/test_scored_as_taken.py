@@ -14,8 +14,8 @@ import trimesh
 from typer.testing import CliRunner
 
 from fieldfuse.camera import Similarity
+from fieldfuse.capture.storage import load_views
 from fieldfuse.capture.types import Views
-from fieldfuse.capture.views_file import load_views
 from fieldfuse.evaluation.baseline import nearest_image_scores
 from fieldfuse.evaluation.geometry import read_mesh
 from fieldfuse.evaluation.images import psnr

@@ -12,7 +12,7 @@ import cv2
 import trimesh
 from safetensors import safe_open
 
-from fieldfuse.capture.views_file import load_views
+from fieldfuse.capture.storage import load_views
 from fieldfuse.files import read_json
 from fieldfuse.render.field import Field
 from tests.pipelines.made import CAMERA, environment, make_room

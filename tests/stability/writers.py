@@ -26,13 +26,13 @@ from PIL import Image
 
 from fieldfuse.camera import Intrinsics, Similarity
 from fieldfuse.capture import open_capture
-from fieldfuse.capture.convert import convert_pictures
+from fieldfuse.capture.convert import convert_images
 from fieldfuse.capture.film import Film
 from fieldfuse.capture.photos import read_photos
 from fieldfuse.capture.select import select_frames
+from fieldfuse.capture.storage import save_views
 from fieldfuse.capture.types import Views
 from fieldfuse.capture.video import read_video
-from fieldfuse.capture.views_file import save_views
 from fieldfuse.config import CaptureSettings, Settings
 from fieldfuse.errors import OutputError
 from fieldfuse.evaluation.compare_page import write_comparison
@@ -175,7 +175,7 @@ def more_writers(place: Path) -> dict[str, Write]:
         "select_frames, a scan": lambda folder: select_frames(scan, folder / f"scan{next(numbers)}", CaptureSettings(max_frames=4)),
         "Film.write_depth, a recording's": lambda folder: recording.write_depth(0, folder / "0.npy"),
         "Film.write_depth, a scan's": lambda folder: Film.of(scan).write_depth(0, folder / "0.png"),
-        "convert_pictures": lambda folder: convert_pictures(read_photos(photos), folder / f"photos{next(numbers)}", 2),
+        "convert_images": lambda folder: convert_images(read_photos(photos), folder / f"photos{next(numbers)}", 2),
         "RunFolder": run_folder,
     }  # fmt: skip
 

@@ -1,4 +1,7 @@
-"""Captures: one reader a source kind, one file each, all returning a `Capture` of `Frame`s."""
+"""Captures: one reader a source kind, one file each, all returning a `Capture` of `Frame`s.
+
+Whatever is wrong with a file raises `InputError`, with one sentence that names it and what to do.
+"""
 
 from __future__ import annotations
 
@@ -14,19 +17,19 @@ def open_capture(source: Path | str, masks: str = "auto", choose: Callable[[Sequ
     """The capture at `source`: a video, a folder of a known layout, a `.sens` file, or one of a layout's JSON files. Found by looking.
 
     Args:
-        masks: what masks beside the images mean: auto (black is left out) | inverted | off.
+        masks: how masks beside the images are read: auto (black is excluded) | inverted | off.
         choose: which of the captures that several COLMAP models make is the right one; None: the one that most images fit by name and size.
 
-    Only listings, metadata and picture headers are read; pixels are decoded of a video's first frame, and of a few pictures with alpha.
+    Only listings, metadata and image headers are read; pixels are decoded of a video's first frame, and of a few images with alpha.
 
     Raises:
         InputError: nothing there, nothing known, or the layout's own files are broken.
     """
     # Imported late: training and rendering need the types above on machines without Pillow.
-    from fieldfuse.capture.beside import with_remark
     from fieldfuse.capture.colmap import model_captures
     from fieldfuse.capture.detect import read_source
     from fieldfuse.capture.masks import with_masks
+    from fieldfuse.capture.photos import with_remark
     from fieldfuse.capture.poses import lenient_poses
     from fieldfuse.capture.usable import turned_by_exif, with_usable_poses
 

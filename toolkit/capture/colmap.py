@@ -1,33 +1,82 @@
 """A COLMAP model with its images. Both may lie anywhere below the folder: `sparse/0` and `images/`, `dense/0/sparse` and `dense/0/images`,
 the model in one folder and the images in its sibling.
 
-A folder may hold several models, of the photos as they were taken and of undistorted ones, or parts that were not joined. Taken is the one
+A folder may hold several models, of the photos as they were taken and of undistorted ones, or parts that were not joined. Used is the one
 that most images fit by name and by size.
+
+Model files are `cameras`, `images`, `points3D`, as `.bin` or `.txt`; every length in them is checked. COLMAP's pixel centres are at +0.5
+like ours.
 """
 
 from __future__ import annotations
 
+import mmap
 import re
+import struct
 from collections.abc import Iterator
-from contextlib import suppress
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
 
-from fieldfuse.camera import Intrinsics
-from fieldfuse.capture.colmap_model import Model, holds_model, read_model
-from fieldfuse.capture.listing import assemble, counted, natural_key, pictures_in, require_folder, unique_names
+from fieldfuse.camera import FISHEYE, OPENCV, PINHOLE, Array, Intrinsics, invert
+from fieldfuse.capture.calibration import fits_shape, fitted, usable_size
+from fieldfuse.capture.headers import image_header
+from fieldfuse.capture.images import spread
+from fieldfuse.capture.listing import assemble, counted, images_in, natural_key, read_text, require_folder, some_of, unique_names
 from fieldfuse.capture.masks import masks_among
+from fieldfuse.capture.poses import checked_place, rigid
 from fieldfuse.capture.resolve import CaptureFiles, Found
-from fieldfuse.capture.sizes import fits_shape, fitted, picture_header
 from fieldfuse.capture.types import Capture, Frame
-from fieldfuse.errors import InputError
+from fieldfuse.errors import InputError, first_line
 
 USUAL = re.compile(r"((colmap|dense|distorted|undistorted)/(\d+/)?)*sparse(/\d+)?|\.")
 MOST_MODELS = 20
-LEAST_IMAGES = 6  # of a model that is held against another
+LEAST_IMAGES = 6  # of a model that is compared with another
 SAMPLED = 24  # images of a model whose sizes are compared with its cameras
+MAX_TEXT = 2**30
+BESIDE = 0.5  # of an image's side by which a principal point may lie outside: images may have been cropped once their camera was known
+MODELS = (  # by COLMAP's numbers: name, parameters, and our lens, where it has one
+    ("SIMPLE_PINHOLE", 3, PINHOLE),
+    ("PINHOLE", 4, PINHOLE),
+    ("SIMPLE_RADIAL", 4, OPENCV),
+    ("RADIAL", 5, OPENCV),
+    ("OPENCV", 8, OPENCV),
+    ("OPENCV_FISHEYE", 8, FISHEYE),
+    ("FULL_OPENCV", 12, OPENCV),
+    ("FOV", 5, None),
+    ("SIMPLE_RADIAL_FISHEYE", 4, FISHEYE),
+    ("RADIAL_FISHEYE", 5, FISHEYE),
+    ("THIN_PRISM_FISHEYE", 12, None),
+    ("RAD_TAN_THIN_PRISM_FISHEYE", 16, None),
+    ("SIMPLE_DIVISION", 4, None),
+    ("DIVISION", 5, None),
+    ("SIMPLE_FISHEYE", 3, FISHEYE),
+    ("FISHEYE", 4, FISHEYE),
+    ("EUCM", 6, None),
+    ("EQUIRECTANGULAR", 2, None),
+)
+SUPPORTED = {name: (count, lens) for name, count, lens in MODELS if lens is not None}
+ONE_FOCAL = ("SIMPLE_PINHOLE", "SIMPLE_RADIAL", "RADIAL", "SIMPLE_RADIAL_FISHEYE", "RADIAL_FISHEYE", "SIMPLE_FISHEYE")
+
+
+@dataclass(frozen=True)
+class ModelImage:
+    """One registered image of a model."""
+
+    name: str
+    camera: int
+    world_from_camera: Array  # (4, 4), OpenCV axes
+
+
+@dataclass(frozen=True)
+class Model:
+    """A reconstruction as stored."""
+
+    cameras: dict[int, Intrinsics]
+    images: list[ModelImage]
+    points: Array  # (N, 3) float64
 
 
 @dataclass(frozen=True)
@@ -68,44 +117,32 @@ def owners(root: Path) -> list[Path]:
 
 def has_images(root: Path) -> bool:
     """Whether images lie where those of a model mostly do."""
-    return any(pictures_in(folder) for folder in (root / "images", root))
+    return any(images_in(folder) for folder in (root / "images", root))
 
 
 def candidate_models(root: Path) -> list[CandidateModel]:
-    """The models that can be read, best first: the one that most images fit, by name and size.
-
-    Raises:
-        InputError: none is there, none can be read, or images of the same names lie in two places.
-    """
+    """The models that can be read, best first: the one that most images fit, by name and size."""
     folders = model_folders(root)
     if not folders:
         raise InputError(f"{root} holds no COLMAP model (cameras and images as .bin or .txt in sparse/0); export one there")
-    top = _above_model(root)
-    files = CaptureFiles(top)
-    candidates, errors = [], []
+    files = CaptureFiles(_above_model(root))
+    candidates, errors, unused = [], [], []
     for folder in folders:
         try:
             candidates.append(_candidate(root, folder, files))
         except InputError as error:
-            errors.append((folder, error))
-    if not candidates:
-        raise errors[0][1]
-    remarks = tuple(f"the model in {_name(root, folder)} is not used: {error}" for folder, error in errors)
+            errors.append(error)
+            unused.append(f"the model in {folder.relative_to(root).as_posix()} is not used: {error}")
     ranked = sorted(candidates, key=lambda one: (-one.fit, -one.exact, -len(one.images)))
-    if not ranked[0].images and errors:
-        raise errors[0][1]
-    return [_among(one, ranked, remarks) for one in ranked]
-
-
-def candidate_captures(path: Path | str) -> Iterator[Capture]:
-    """The captures that the models in a folder make, best first; each is made when it is asked for.
-
-    Raises:
-        InputError: no model, a broken model, none of its images on disk, or an image of another shape than its camera.
-    """
-    root = require_folder(path)
-    for candidate in candidate_models(root):
-        yield _capture(root, candidate)
+    if errors and (not ranked or not ranked[0].images):
+        raise errors[0]
+    out = []
+    for one in ranked:
+        others = [other for other in ranked if other is not one]
+        rest = [f"{other.name} ({counted(len(other.model.images), 'image')}, {other.fit} of which fit)" for other in others]
+        remark = f"of several models that in {one.name} is used, which {one.fit} images fit; not used: {some_of(rest)}"
+        out.append(replace(one, remarks=(*unused, *([remark] if rest else []), *one.remarks)))
+    return out
 
 
 def model_captures(capture: Capture) -> list[Capture]:
@@ -116,7 +153,7 @@ def model_captures(capture: Capture) -> list[Capture]:
     for candidate in candidate_models(capture.root)[1:MOST_MODELS]:
         with suppress(InputError):
             if len(candidate.images) >= max(LEAST_IMAGES, len(capture.frames) // 2):
-                out.append(_capture(capture.root, candidate))
+                out.append(candidate_capture(capture.root, candidate))
     return out
 
 
@@ -124,12 +161,14 @@ def read_colmap(path: Path | str) -> Capture:
     """The registered images that exist, with cameras, poses and sparse points in the model's frame.
 
     Raises:
-        InputError: as `candidate_captures`.
+        InputError: no model, a broken model, none of its images on disk, or an image of another shape than its camera.
     """
-    return next(candidate_captures(path))
+    root = require_folder(path)
+    return candidate_capture(root, candidate_models(root)[0])
 
 
-def _capture(root: Path, candidate: CandidateModel) -> Capture:
+def candidate_capture(root: Path, candidate: CandidateModel) -> Capture:
+    """The capture that one of the models makes."""
     model, images = candidate.model, candidate.images
     listed = len(model.images)
     if not images:
@@ -139,21 +178,21 @@ def _capture(root: Path, candidate: CandidateModel) -> Capture:
     for index, name in zip(located, unique_names([images[index] for index in located]), strict=True):
         entry = model.images[index]
         described = model.cameras[entry.camera]
-        intrinsics = fitted(described, picture_header(images[index]).size, f"{entry.name} in {root / candidate.name}", images[index])
+        intrinsics = fitted(described, image_header(images[index]).size, f"{entry.name} in {root / candidate.name}", images[index])
         scaled += intrinsics is not described
         frames.append(Frame(name=name, image=images[index], intrinsics=intrinsics, world_from_camera=entry.world_from_camera))
     missing = listed - len(frames)
     if missing:
         warnings.append(f"{missing} of the {listed} images of the model do not exist; the other {len(frames)} are used")
     if scaled:
-        warnings.append(f"{counted(scaled, 'picture')} of another size than the model tells; intrinsics were scaled to fit")
+        warnings.append(f"{counted(scaled, 'image')} of another size than in the model; intrinsics were scaled to fit")
     used = set(images.values())
     unregistered = 0
     for folder in {image.parent for image in used}:
-        pictures = pictures_in(folder)
-        unregistered += len(set(pictures) - used - masks_among(pictures))
+        beside = images_in(folder)
+        unregistered += len(set(beside) - used - masks_among(beside))
     if unregistered:
-        warnings.append(f"{counted(unregistered, 'picture')} beside these are not in the model and are left out")
+        warnings.append(f"{counted(unregistered, 'image')} beside these are not in the model and are left out")
     extra = {"listed": listed, "missing": missing, "unregistered": unregistered}
     return assemble("colmap", root, frames, warnings, points=model.points if len(model.points) else None, extra=extra)
 
@@ -162,23 +201,23 @@ def _candidate(root: Path, folder: Path, files: CaptureFiles) -> CandidateModel:
     """The model in `folder` with the images that fit it best: of the folders around it, nearest first, else of any other."""
     model = read_model(folder)
     names = [image.name for image in model.images]
-    name = _name(root, folder)
+    name = folder.relative_to(root).as_posix()
     found: Found | None = None
     best = (0, 0.0)
-    for base in _bases(folder.resolve(), files):
-        here = files.find(names, source=name, base=base, anywhere=False)
-        fit = _fit(model, here)
-        if here.count and (found is None or fit > best):
-            found, best = here, fit
-        if best[1] == 1 and found is not None and found.count == len(names):
+    for above in (folder.resolve(), *folder.resolve().parents):
+        for base in (place.relative_to(files.root).as_posix() for place in (above / "images", above) if place.is_dir()):
+            here = files.find(names, source=name, base=base, anywhere=False)
+            fit = _fit(model, here)
+            if here.count and (found is None or fit > best):
+                found, best = here, fit
+        if above == files.root or (found is not None and best[1] == 1 and found.count == len(names)):
             break
     remarks: list[str] = []
     if found is None:
         found = files.find(names, source=name, base="images", anywhere=files.root == root.resolve())
         best = _fit(model, found)
         places = sorted({path.parent.relative_to(files.root).as_posix() for path in found.files if path is not None})
-        if places:
-            remarks.append(f"the images of the model in {name} were found in {', '.join(places[:3])}{', …' if len(places) > 3 else ''}")
+        remarks += [f"the images of the model in {name} were found in {some_of(places)}"] if places else []
     else:
         remarks += found.remarks
     if not USUAL.fullmatch(name):
@@ -187,33 +226,18 @@ def _candidate(root: Path, folder: Path, files: CaptureFiles) -> CandidateModel:
     return CandidateModel(name, model, there, *best, found.outside, tuple(remarks))
 
 
-def _bases(folder: Path, files: CaptureFiles) -> list[str]:
-    """Where the images of the model in `folder` may lie: in `images/` beside it, then beside it, then further up to the top."""
-    out = []
-    for above in (folder, *folder.parents):
-        out += [place.relative_to(files.root).as_posix() for place in (above / "images", above) if place.is_dir()]
-        if above == files.root:
-            return out
-    return out
-
-
 def _fit(model: Model, found: Found) -> tuple[int, float]:
     """How many images have their camera's shape, and the share of those looked at that have its very size."""
-    there = [index for index, path in enumerate(found.files) if path is not None]
-    if not there:
-        return 0, 0.0
-    chosen = [there[int(place)] for place in np.unique(np.linspace(0, len(there) - 1, SAMPLED).round())]
-    shapes = [_shape(model.cameras[model.images[index].camera], found.files[index]) for index in chosen]
-    return round(len(there) * sum(shape > 0 for shape in shapes) / len(shapes)), sum(shape == 2 for shape in shapes) / len(shapes)
-
-
-def _shape(camera: Intrinsics, path: Path | None) -> int:
-    """2: an image of the camera's size, 1: of its shape, 0: of neither, or no image."""
-    try:
-        size = picture_header(path).size if path is not None else (0, 0)
-    except InputError:
-        return 0
-    return 2 if size == (camera.width, camera.height) else int(fits_shape(camera, size))
+    there = [(image, path) for image, path in zip(model.images, found.files, strict=True) if path is not None]
+    chosen = spread(there, SAMPLED)
+    shapes = exact = 0
+    for image, path in chosen:
+        camera = model.cameras[image.camera]
+        with suppress(InputError):
+            size = image_header(path).size
+            exact += size == (camera.width, camera.height)
+            shapes += fits_shape(camera, size)
+    return round(len(there) * shapes / max(len(chosen), 1)), exact / max(len(chosen), 1)
 
 
 def _above_model(root: Path) -> Path:
@@ -226,15 +250,171 @@ def _above_model(root: Path) -> Path:
     return top
 
 
-def _name(root: Path, folder: Path) -> str:
-    return folder.relative_to(root).as_posix()
+# --------------------------------------------------------------------------------------------------- model files
 
 
-def _among(one: CandidateModel, ranked: list[CandidateModel], remarks: tuple[str, ...]) -> CandidateModel:
-    """The candidate with a remark on those that it was chosen from."""
-    rest = [other for other in ranked if other is not one]
-    others = [f"{other.name} ({counted(len(other.model.images), 'image')}, {other.fit} of which fit)" for other in rest]
-    if others:
-        more = ", …" if len(others) > 3 else ""
-        remarks += (f"of several models that in {one.name} is used, which {one.fit} images fit; not used: {', '.join(others[:3])}{more}",)
-    return replace(one, remarks=remarks + one.remarks)
+def holds_model(folder: Path) -> bool:
+    return any(all((folder / f"{part}{suffix}").is_file() for part in ("cameras", "images")) for suffix in (".bin", ".txt"))
+
+
+def read_model(folder: Path) -> Model:
+    """The model in `folder`; binary files go before text files."""
+    binary = all((folder / f"{part}.bin").is_file() for part in ("cameras", "images"))
+    cameras, images, points = (folder / f"{part}.{'bin' if binary else 'txt'}" for part in ("cameras", "images", "points3D"))
+    positions = np.zeros((0, 3))
+    if points.is_file():
+        positions = np.fromiter((_points_bin if binary else _points_txt)(points), dtype=np.dtype((np.float64, 3)))
+    model = Model(
+        dict((_cameras_bin if binary else _cameras_txt)(cameras)),
+        list((_images_bin if binary else _images_txt)(images)),
+        positions[np.isfinite(positions).all(axis=1)],
+    )
+    if not model.images:
+        raise InputError(f"the model in {folder} has no registered images; run structure from motion again")
+    for image in model.images:
+        if image.camera not in model.cameras:
+            raise InputError(f"{images}: the image {image.name!r} uses camera {image.camera}, which {cameras.name} does not hold")
+    return model
+
+
+def intrinsics_of(model: str, width: int, height: int, values: list[float], where: str) -> Intrinsics:
+    """A COLMAP camera as ours; its radial models are OpenCV's with the absent coefficients 0."""
+    if model not in SUPPORTED:
+        raise InputError(f"{where}: the camera model {model} is not supported; run `colmap image_undistorter` and give its output")
+    count, kind = SUPPORTED[model]
+    if len(values) != count:
+        raise InputError(f"{where}: the camera model {model} has {count} parameters, not {len(values)}; check how the file was written")
+    fx, fy, cx, cy, *lens = [values[0], *values] if model in ONE_FOCAL else values
+    if kind != PINHOLE:
+        lens += [0.0] * (4 - len(lens))
+    return Intrinsics(*usable_size(width, height, where), fx, fy, cx, cy, kind, tuple(lens)).checked(where).centred(where, BESIDE)
+
+
+def _image(name: str, camera: int, values: list[float], where: str) -> ModelImage:
+    """From the quaternion and translation of camera_from_world."""
+    place = np.array(values[4:])
+    if not np.isfinite(place).all():
+        raise InputError(f"{where}: the pose of {name!r} holds a value that is not finite; remove this image from the model")
+    where = f"{where}, image {name!r}"
+    checked_place(place, where)
+    return ModelImage(name, camera, invert(rigid(np.array(values[:4]), place, where)))
+
+
+# --------------------------------------------------------------------------------------------------- binary
+
+
+class _Reader:
+    """Reads little-endian values from a buffer, never beyond its end."""
+
+    def __init__(self, buffer: mmap.mmap | bytes, path: Path) -> None:
+        self.buffer, self.path, self.at, self.size = buffer, path, 0, len(buffer)
+
+    def skip(self, count: int, width: int) -> None:
+        if count * width > self.size - self.at:
+            raise InputError(
+                f"{self.path} ends before its own counts (at byte {self.at} of {self.size}); copy or write the model again"
+            )
+        self.at += count * width
+
+    def take(self, layout: str) -> tuple[float, ...]:
+        self.skip(1, struct.calcsize(layout))
+        return struct.unpack_from(layout, self.buffer, self.at - struct.calcsize(layout))
+
+    def count(self, smallest: int) -> int:
+        """A number of records, each at least `smallest` bytes long."""
+        value, at = int(self.take("<Q")[0]), self.at
+        self.skip(value, smallest)
+        self.at = at
+        return value
+
+    def text(self) -> str:
+        end = self.buffer.find(b"\0", self.at, min(self.size, self.at + 4096))
+        raw = bytes(self.buffer[self.at : max(end, self.at)])
+        self.at = end + 1
+        try:
+            if end < 0:
+                raise ValueError
+            return raw.decode("utf-8")
+        except ValueError as error:
+            raise InputError(f"{self.path} holds an image name without end, or not in UTF-8; check how it was written") from error
+
+
+@contextmanager
+def _opened(path: Path) -> Iterator[_Reader]:
+    # Mapped, not read: `images.bin` holds every feature point and may be larger than memory.
+    try:
+        with path.open("rb") as stream:
+            if path.stat().st_size == 0:
+                raise InputError(f"{path} is empty; copy or write the model again")
+            with mmap.mmap(stream.fileno(), 0, access=mmap.ACCESS_READ) as buffer:
+                yield _Reader(buffer, path)
+    except OSError as error:
+        raise InputError(f"cannot read {path}: {error.strerror or error}") from error
+
+
+def _cameras_bin(path: Path) -> Iterator[tuple[int, Intrinsics]]:
+    with _opened(path) as reader:
+        for _ in range(reader.count(24)):
+            number, model, width, height = (int(value) for value in reader.take("<IiQQ"))
+            if not 0 <= model < len(MODELS):
+                raise InputError(f"{path}: camera {number} has the unknown model {model}; check how the file was written")
+            name, count, _ = MODELS[model]
+            yield number, intrinsics_of(name, width, height, list(reader.take(f"<{count}d")), f"{path}, camera {number}")
+
+
+def _images_bin(path: Path) -> Iterator[ModelImage]:
+    with _opened(path) as reader:
+        for _ in range(reader.count(73)):
+            values = reader.take("<I7dI")
+            name = reader.text()
+            reader.skip(reader.count(24), 24)
+            yield _image(name, int(values[8]), list(values[1:8]), str(path))
+
+
+def _points_bin(path: Path) -> Iterator[tuple[float, ...]]:
+    with _opened(path) as reader:
+        for _ in range(reader.count(51)):
+            values = reader.take("<QdddBBBdQ")
+            yield values[1:4]
+            reader.skip(int(values[8]), 8)
+
+
+# --------------------------------------------------------------------------------------------------- text
+
+
+@contextmanager
+def _line(path: Path, number: int) -> Iterator[None]:
+    """Around the parsing of a line, which is named where it fails."""
+    try:
+        yield
+    except (ValueError, IndexError) as error:
+        raise InputError(f"{path}, line {number + 1} cannot be read ({first_line(error)}); check how it was written") from error
+
+
+def _cameras_txt(path: Path) -> Iterator[tuple[int, Intrinsics]]:
+    for number, line in enumerate(read_text(path, MAX_TEXT).splitlines()):
+        words = line.split()
+        if words and not words[0].startswith("#"):
+            with _line(path, number):
+                camera, model, width, height = int(words[0]), words[1], int(words[2]), int(words[3])
+                values = [float(word) for word in words[4:]]
+            yield camera, intrinsics_of(model, width, height, values, f"{path}, camera {camera}")
+
+
+def _images_txt(path: Path) -> Iterator[ModelImage]:
+    numbered = iter(enumerate(read_text(path, MAX_TEXT).splitlines()))
+    for number, line in numbered:
+        words = line.strip().split(maxsplit=9)
+        if words and not words[0].startswith("#"):
+            next(numbered, None)  # the feature points of this image; the line may be blank
+            with _line(path, number):
+                values, camera, name = [float(word) for word in words[1:8]], int(words[8]), words[9]
+            yield _image(name, camera, values, str(path))
+
+
+def _points_txt(path: Path) -> Iterator[tuple[float, ...]]:
+    for number, line in enumerate(read_text(path, MAX_TEXT).splitlines()):
+        words = line.split(maxsplit=4)
+        if words and not words[0].startswith("#"):
+            with _line(path, number):
+                yield float(words[1]), float(words[2]), float(words[3])

@@ -1,5 +1,9 @@
-"""Pictures written once as JPEG. HEIF: it takes ten times as long to decode, which every stage would do again, and few other programs
-read it. Photos that EXIF mirrors: no camera could be exported for what their files hold."""
+"""Images written once as JPEG, and cameras for the pixels as files hold them.
+
+HEIF takes ten times as long to decode as JPEG, which every stage would do again, and few other programs read it; for photos that EXIF
+mirrors no camera could be exported. Both are written anew. Photos are turned upright by EXIF before anything is done with them; other
+programs, and captures that come with poses, take the pixels as they are stored.
+"""
 
 from __future__ import annotations
 
@@ -8,15 +12,15 @@ from dataclasses import replace
 from pathlib import Path
 
 import cv2
+import numpy as np
 
+from fieldfuse.camera import FISHEYE, Array, Intrinsics
 from fieldfuse.capture.checks import check_capture
-from fieldfuse.capture.headers import orientation_of
+from fieldfuse.capture.headers import image_header, orientation_of
 from fieldfuse.capture.heif import file_is_heif
-from fieldfuse.capture.images import read_picture, turns_by_exif, upright
+from fieldfuse.capture.images import read_image, turns_by_exif, upright
 from fieldfuse.capture.listing import counted, unique_names
-from fieldfuse.capture.sizes import picture_header
-from fieldfuse.capture.stored import MIRRORED
-from fieldfuse.capture.types import Capture, Frame
+from fieldfuse.capture.types import Capture
 from fieldfuse.errors import InputError, OutputError, first_line
 from fieldfuse.files import atomic_path, fingerprint, read_json, write_json
 from fieldfuse.progress import SILENT, Progress
@@ -24,13 +28,15 @@ from fieldfuse.threads import share
 
 VERSION = 2  # of what is written
 QUALITY = 97  # of the JPEG files, as of a video's frames
-MOST_AT_ONCE, PIXELS_AT_ONCE = 8, 200e6  # pictures, and their pixels, on their way at a time: a pixel takes about ten bytes
-CONVERTED = "converted"  # in `Capture.extra`: how many pictures were
+MOST_AT_ONCE, PIXELS_AT_ONCE = 8, 200e6  # images, and their pixels, on their way at a time: a pixel takes about ten bytes
+CONVERTED = "converted"  # in `Capture.extra`: how many images were
 MARKER = "converted.json"  # beside them: what each was made of
+TURNS = {3: (-1, 0), 6: (0, 1), 8: (0, -1)}  # EXIF orientation → cosine and sine of the turn from the upright image to the stored one
+MIRRORED = (2, 4, 5, 7)  # orientations that no camera has: rotations do not mirror
 
 
 def to_convert(capture: Capture) -> list[int]:
-    """Indices of the frames whose pictures are HEIF, or photos that are to be mirrored."""
+    """Indices of the frames whose images are HEIF, or photos that are to be mirrored."""
     exif = turns_by_exif(capture)
     return [
         i
@@ -40,22 +46,21 @@ def to_convert(capture: Capture) -> list[int]:
 
 
 def all_converted(capture: Capture) -> bool:
-    """Whether every picture is one that `convert_pictures` wrote."""
+    """Whether every image is one that `convert_images` wrote."""
     return CONVERTED in capture.extra and all((folder / MARKER).is_file() for folder in {frame.image.parent for frame in capture.frames})
 
 
-def convert_pictures(capture: Capture, out: Path, threads: int, progress: Progress = SILENT) -> Capture:
-    """The capture with every picture that `to_convert` names replaced by an upright JPEG (with alpha: PNG) of the same name in
-    `out/frames`, in sRGB.
+def convert_images(capture: Capture, out: Path, threads: int, progress: Progress = SILENT) -> Capture:
+    """The capture with every image of `to_convert` replaced by an upright JPEG (with alpha: PNG) of the same name in `out/frames`, in sRGB.
 
-    What is there and is of the same file is not written again, so a killed run goes on where it stopped.
+    What is there and is of the same file is not written again, so a killed run continues where it stopped.
 
     Returns:
-        the capture, checked; `extra["converted"]` counts the pictures.
+        the capture, checked; `extra["converted"]` counts the images.
 
     Raises:
-        InputError: a picture is damaged, or the capture is unusable (see `check_capture`).
-        OutputError: a picture cannot be written.
+        InputError: an image is damaged, or the capture is unusable (see `check_capture`).
+        OutputError: an image cannot be written.
     """
     indices = to_convert(capture)
     folder = Path(out) / "frames"
@@ -67,39 +72,34 @@ def convert_pictures(capture: Capture, out: Path, threads: int, progress: Progre
         nonlocal finished
         name, index = one
         progress.check()
-        path = done.get(name) or write_picture(capture.frames[index].image, folder / name)
+        path = done.get(name) or write_image(capture.frames[index].image, folder / name)
         finished += 1
-        progress.update(finished, len(indices), f"{finished} of {counted(len(indices), 'picture')} as JPEG")
-        return index, path
+        progress.update(finished, len(indices), f"{finished} of {counted(len(indices), 'image')} as JPEG")
+        return index, path.resolve()
 
-    largest = max((math.prod(picture_header(capture.frames[i].image).size) for i in indices), default=1)
+    largest = max((math.prod(image_header(capture.frames[i].image).size) for i in indices), default=1)
     at_once = max(1, min(threads, MOST_AT_ONCE, int(PIXELS_AT_ONCE / largest)))
     written = dict(share(convert, list(zip(names, indices, strict=True)), at_once))
-    frames = tuple(_with_picture(frame, written.get(i)) for i, frame in enumerate(capture.frames))
-    return check_capture(replace(capture, frames=frames, extra={**capture.extra, CONVERTED: len(indices)}), progress)
+    frames = [replace(frame, image=written.get(i, frame.image)) for i, frame in enumerate(capture.frames)]
+    return check_capture(replace(capture.with_frames(frames), extra={**capture.extra, CONVERTED: len(indices)}), progress)
 
 
-def write_picture(source: Path, target: Path) -> Path:
-    """A picture, upright, as `target` with `.jpg` added, or `.png` where it has alpha; which of the two is told.
-
-    Raises:
-        InputError: it cannot be decoded.
-        OutputError: it cannot be written.
-    """
-    picture = upright(*read_picture(source))
-    alpha = picture.shape[2] == 4
+def write_image(source: Path, target: Path) -> Path:
+    """Write an image, upright, as `target` with `.jpg` added, or `.png` where it has alpha, and return that path."""
+    image = upright(*read_image(source))
+    alpha = image.shape[2] == 4
     path = target.with_name(f"{target.name}.{'png' if alpha else 'jpg'}")
     order = cv2.COLOR_RGBA2BGRA if alpha else cv2.COLOR_RGB2BGR
-    coded, data = cv2.imencode(path.suffix, cv2.cvtColor(picture, order), [] if alpha else [cv2.IMWRITE_JPEG_QUALITY, QUALITY])
+    coded, data = cv2.imencode(path.suffix, cv2.cvtColor(image, order), [] if alpha else [cv2.IMWRITE_JPEG_QUALITY, QUALITY])
     if not coded:
-        raise OutputError(f"the picture {source} cannot be encoded as {path.suffix[1:].upper()}; convert it by another program")
+        raise OutputError(f"the image {source} cannot be encoded as {path.suffix[1:].upper()}; convert it by another program")
     with atomic_path(path) as temporary:
         temporary.write_bytes(data.tobytes())
     return path
 
 
 def _still_good(folder: Path, wanted: dict[str, str]) -> dict[str, Path]:
-    """Of the pictures wanted (name → state of its source) those that an earlier attempt left there; what it left of other sources is
+    """Of the images wanted (name → state of its source) those that an earlier attempt left there; what it left of other sources is
     removed, and what is wanted is noted down."""
     marker = folder / MARKER
     try:
@@ -122,5 +122,36 @@ def _still_good(folder: Path, wanted: dict[str, str]) -> dict[str, Path]:
     return found
 
 
-def _with_picture(frame: Frame, path: Path | None) -> Frame:
-    return frame if path is None else replace(frame, image=path.resolve())
+def stored_cameras(capture: Capture) -> tuple[list[Intrinsics], Array]:
+    """Intrinsics and (N, 4, 4) world_from_camera of a posed capture's frames, for the pixels as their files hold them.
+
+    Those of mirrored files stay as they are; `convert_images` writes such images anew.
+    """
+    turned = turns_by_exif(capture)
+    found = [
+        as_stored(frame.intrinsics, frame.world_from_camera, orientation_of(frame.image) if turned else 1)
+        for frame in capture.frames
+        if frame.intrinsics is not None and frame.world_from_camera is not None
+    ]
+    return [camera for camera, _ in found], np.array([pose for _, pose in found], dtype=np.float64).reshape(-1, 4, 4)
+
+
+def as_stored(camera: Intrinsics, world_from_camera: Array, orientation: int) -> tuple[Intrinsics, Array]:
+    """The camera of an upright image, for the file that EXIF `orientation` turns into it: x_stored = R · x_upright about the axis.
+
+    A lens keeps its radial terms; the tangential ones are a vector across the image, (p2, p1), and turn with it.
+    """
+    if orientation not in TURNS:
+        return camera, world_from_camera
+    cosine, sine = TURNS[orientation]
+    turn = np.array([[cosine, sine], [-sine, cosine]], dtype=np.float64)
+    width, height = (camera.height, camera.width) if sine else (camera.width, camera.height)
+    fx, fy = (camera.fy, camera.fx) if sine else (camera.fx, camera.fy)
+    cx, cy = turn @ [camera.cx - camera.width / 2, camera.cy - camera.height / 2] + [width / 2, height / 2]
+    lens = camera.distortion
+    if camera.lens != FISHEYE and len(lens) >= 4:
+        p2, p1 = turn @ [lens[3], lens[2]]
+        lens = (*lens[:2], float(p1), float(p2), *lens[4:])
+    pose = np.array(world_from_camera, dtype=np.float64)
+    pose[:3, :2] = pose[:3, :2] @ turn.T
+    return replace(camera, width=width, height=height, fx=fx, fy=fy, cx=float(cx), cy=float(cy), distortion=lens), pose

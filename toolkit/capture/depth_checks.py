@@ -8,9 +8,9 @@ from itertools import combinations
 import numpy as np
 
 from fieldfuse.camera import Array, Intrinsics, invert
-from fieldfuse.capture.images import load_depth
-from fieldfuse.capture.sizes import fitted
-from fieldfuse.capture.types import Capture
+from fieldfuse.capture.calibration import fitted
+from fieldfuse.capture.images import load_depth, spread
+from fieldfuse.capture.types import Capture, Frame
 from fieldfuse.errors import InputError
 from fieldfuse.progress import SILENT, Progress
 
@@ -48,27 +48,28 @@ class Sample:
     values: Array  # (N,) depth at them
 
     @classmethod
-    def of(cls, depth: Array, camera: Intrinsics, pose: Array) -> Sample:
+    def of(cls, depth: Array, frame: Frame) -> Sample | None:
+        """Of a frame's depth (H, W) in any unit; None where it is empty, or the frame has no camera or pose."""
+        camera = frame.depth_intrinsics or frame.intrinsics
+        camera = None if camera is None else fitted(camera, (depth.shape[1], depth.shape[0]), str(frame.depth)).pinhole()
         row, column = np.nonzero(depth > 0)
+        if camera is None or frame.world_from_camera is None or not len(row):
+            return None
         some = np.random.default_rng(0).permutation(len(row))[:POINTS]  # not every n-th, which may all lie in a few columns
         row, column = row[some], column[some]
-        return cls(depth, camera.pinhole(), pose, np.stack([column + 0.5, row + 0.5], axis=1), depth[row, column].astype(np.float64))
+        pixels = np.stack([column + 0.5, row + 0.5], axis=1)
+        return cls(depth, camera, frame.world_from_camera, pixels, depth[row, column].astype(np.float64))
 
 
 def check_depth(capture: Capture, progress: Progress = SILENT) -> list[str]:
-    """Warnings about the depth maps of `capture`; none when it has no depth.
-
-    Raises:
-        InputError: a depth file is missing or damaged, no map holds a value, or depth and poses are in different units.
-    """
+    """Warnings about the depth maps of `capture`; none when it has no depth."""
     frames = [frame for frame in capture.frames if frame.depth is not None]
     if not frames:
         return []
     for frame in frames:
         if frame.depth is not None and not frame.depth.is_file():
             raise InputError(f"the depth map {frame.depth} of {frame.name} is not there; add it or remove the frame")
-    order = sorted(range(len(frames)), key=lambda index: frames[index].name) if not capture.ordered else range(len(frames))
-    chosen = [frames[order[int(index)]] for index in np.unique(np.linspace(0, len(frames) - 1, min(LOOKED_AT, len(frames))).round())]
+    chosen = spread(frames if capture.ordered else sorted(frames, key=lambda frame: frame.name), min(LOOKED_AT, len(frames)))
     filled, medians, samples = [], [], []
     for index, frame in enumerate(chosen):
         progress.check()
@@ -76,18 +77,13 @@ def check_depth(capture: Capture, progress: Progress = SILENT) -> list[str]:
         depth = load_depth(frame, capture)
         there = depth[depth > 0]
         filled.append(there.size / depth.size)
-        camera = frame.depth_intrinsics or frame.intrinsics
-        if camera is not None:
-            camera = fitted(camera, (depth.shape[1], depth.shape[0]), str(frame.depth))
-        if there.size:
-            medians.append(float(np.median(there)))
-            if camera is not None and frame.world_from_camera is not None:
-                samples.append(Sample.of(depth, camera, frame.world_from_camera))
+        medians += [float(np.median(there))] if there.size else []
+        samples.append(Sample.of(depth, frame))
     if not medians:
         raise InputError(
             f"no depth map in {capture.root} holds a value (all are 0, NaN or 65535); check how depth was written, or remove it"
         )
-    _refuse_wrong_unit(capture, float(np.median(medians)), samples)
+    _refuse_wrong_unit(capture, float(np.median(medians)), [sample for sample in samples if sample is not None])
     warnings = []
     empty = sum(share == 0 for share in filled)
     if empty:
@@ -101,19 +97,15 @@ def check_depth(capture: Capture, progress: Progress = SILENT) -> list[str]:
 
 
 def _refuse_wrong_unit(capture: Capture, median: float, samples: list[Sample]) -> None:
-    advice = WHAT_TO_SET.get(capture.kind, OTHERWISE)
     factor = unit_factor(samples)
     if factor != 1.0:
         times = f"{factor:g} times larger" if factor > 1 else f"{1 / factor:g} times smaller"
-        raise InputError(
-            f"the depth in {capture.root} (median {median:.3g}) does not fit the camera's motion, but would if it were {times}, "
-            f"so its unit is probably another one; {advice}"
-        )
-    if capture.metric and not NEAREST <= median <= FARTHEST:
-        raise InputError(
-            f"the median depth in {capture.root} is {median:.3g} m, which no depth camera measures, "
-            f"so its unit is probably another one; {advice}"
-        )
+        why = f"the depth in {capture.root} (median {median:.3g}) does not fit the camera's motion, but would if it were {times}"
+    elif capture.metric and not NEAREST <= median <= FARTHEST:
+        why = f"the median depth in {capture.root} is {median:.3g} m, which no depth camera measures"
+    else:
+        return
+    raise InputError(f"{why}, so its unit is probably another one; {WHAT_TO_SET.get(capture.kind, OTHERWISE)}")
 
 
 def unit_factor(samples: list[Sample]) -> float:
@@ -124,7 +116,8 @@ def unit_factor(samples: list[Sample]) -> float:
     beside their surfaces. Where there is no such peak the pair has no vote: frames hardly moved, they see different things, or the scene
     looks the same from everywhere (along a corridor, large depth always agrees, since the camera then seems to stand still).
     """
-    found = [np.log(factor) for a, b in _pairs(samples) if (factor := _peak(a, b)) is not None]
+    pairs = [(a, b) for a, b in combinations(samples, 2) if a.pose[:3, 2] @ b.pose[:3, 2] > 0.5 and np.any(a.pose[:3, 3] != b.pose[:3, 3])]
+    found = [np.log(factor) for a, b in spread(pairs, PAIRS) if (factor := _peak(a, b)) is not None]
     others = np.array([value for value in found if abs(value) > np.log(APART)])
     if not len(others):
         return 1.0
@@ -133,24 +126,15 @@ def unit_factor(samples: list[Sample]) -> float:
     votes = int(agree[mode].sum())
     if votes < VOTES or votes < MAJORITY * len(found):
         return 1.0
-    return _named(float(np.exp(np.median(others[agree[mode]]))))
-
-
-def _named(factor: float) -> float:
-    """The factor of a unit that is confused with another, where it is near to one; else itself with two digits."""
+    # The factor of a unit that is confused with another, where it is near to one; else itself with two digits.
+    factor = float(np.exp(np.median(others[agree[mode]])))
     near = min((unit for known in UNITS for unit in (known, 1 / known)), key=lambda unit: abs(np.log(unit / factor)))
     return near if abs(np.log(near / factor)) < np.log(SAME) else float(f"{factor:.2g}")
 
 
-def _pairs(samples: list[Sample]) -> list[tuple[Sample, Sample]]:
-    """Pairs of frames from different places that look much the same way."""
-    found = [(a, b) for a, b in combinations(samples, 2) if a.pose[:3, 2] @ b.pose[:3, 2] > 0.5 and np.any(a.pose[:3, 3] != b.pose[:3, 3])]
-    return [found[int(place)] for place in np.unique(np.linspace(0, len(found) - 1, PAIRS).round())] if found else []
-
-
 def _peak(a: Sample, b: Sample) -> float | None:
     """The factor under which two maps agree best, both ways; None where it does not stand out."""
-    shares = (agreement(a, b) + agreement(b, a)) / 2
+    shares = (_agreement(a, b) + _agreement(b, a)) / 2
     best = int(shares.argmax())
     apart = round(np.log(APART) / np.log(STEP))
     smaller, larger = shares[: max(best - apart, 0)], shares[best + apart :]
@@ -159,7 +143,7 @@ def _peak(a: Sample, b: Sample) -> float | None:
     return float(FACTORS[best]) if shares[best] - max(smaller.max(), larger.max()) >= CONTRAST else None
 
 
-def agreement(a: Sample, b: Sample) -> Array:
+def _agreement(a: Sample, b: Sample) -> Array:
     """(F,) for each of `FACTORS`, by which both depths are multiplied: the share of a's points that lie on b's surface, those that are off
     by a part of `AGREE` counted by the rest."""
     b_from_a = invert(b.pose) @ a.pose

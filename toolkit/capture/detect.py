@@ -1,4 +1,4 @@
-"""Which kind of capture lies at a path, found by looking at names (and, between two layouts, at two picture headers).
+"""Which kind of capture lies at a path, found by looking at names (and, between two layouts, at two image headers).
 
 The order is deliberate: what somebody wrote for this very purpose goes before what another step left behind.
 1. `transforms.json`: nerfstudio leaves its COLMAP model beside it;
@@ -7,9 +7,9 @@ The order is deliberate: what somebody wrote for this very purpose goes before w
    phones with a depth sensor among them;
 4. DTU's `cameras*.npz`;
 5. a COLMAP model before LLFF's `poses_bounds.npy`: sets that have both keep lens and points only in the model, but only
-   when its pictures are there (sets at 1/8 size often come without them);
+   when its images are there (sets at 1/8 size often come without them);
 6. colour and depth in folders of any name, with a list of poses;
-7. photos; 8. one video (or recording in one file) in a folder, alone or with one picture (its cover);
+7. photos; 8. one video (or recording in one file) in a folder, alone or with one image (its cover);
 9. the only capture in a folder further down, as unpacking leaves it.
 """
 
@@ -23,7 +23,7 @@ from fieldfuse.capture.archive import SUFFIXES as ARCHIVES
 from fieldfuse.capture.blender import looks_like_blender, read_blender
 from fieldfuse.capture.colmap import candidate_models, has_images, looks_like_colmap, owners, read_colmap
 from fieldfuse.capture.dtu import looks_like_dtu, read_dtu
-from fieldfuse.capture.listing import PICTURES, counted, natural_key, pictures_in, require_folder
+from fieldfuse.capture.listing import IMAGES, counted, images_in, natural_key, require_folder, some_of
 from fieldfuse.capture.llff import looks_like_llff, read_llff
 from fieldfuse.capture.photos import looks_like_photos, photo_files, read_photos
 from fieldfuse.capture.polycam import looks_like_polycam, read_polycam
@@ -46,25 +46,21 @@ from fieldfuse.errors import InputError
 from fieldfuse.files import require_utf8
 
 FILMS = (*VIDEO_SUFFIXES, RECORD3D)
-DEEPEST, MOST_FOLDERS = 3, 200  # where captures are looked for that are not where they were said to be
+DEEPEST, MOST_FOLDERS = 3, 200  # where captures are looked for that are not in the given folder itself
 CAMERA_RAW = (".dng", ".cr2", ".cr3", ".nef", ".arw", ".raf", ".orf", ".rw2", ".pef", ".srw")
 
 
 def _colmap_without_llff(path: Path) -> bool:
-    if not looks_like_colmap(path):
-        return _model_further_down(path)
-    return not looks_like_llff(path) or has_images(path)
-
-
-def _model_further_down(path: Path) -> bool:
-    """Whether a model below is this folder's: its images lie here or in a sibling, and no capture of its own is around it."""
+    if looks_like_colmap(path):
+        return not looks_like_llff(path) or has_images(path)
+    # A model below is this folder's where its images lie here or in a sibling, and no capture of its own is around it.
     models = owners(path)
-    if not models or looks_like_llff(path) or sum(map(has_images, models)) > 0 or captures_below(path) != models:
+    if not models or looks_like_llff(path) or any(map(has_images, models)) or captures_below(path) != models:
         return False
     try:
         return bool(candidate_models(path)[0].images)
     except InputError:
-        return not looks_like_photos(path)  # the reader says what is wrong
+        return not looks_like_photos(path)  # the reader reports what is wrong
 
 
 def captures_below(folder: Path) -> list[Path]:
@@ -79,27 +75,21 @@ def captures_below(folder: Path) -> list[Path]:
 
 
 def _folders_below(folder: Path) -> list[Path]:
-    listing = CaptureFiles(folder).folders()
-    return [folder / name for name in listing if name and name.count("/") < DEEPEST][:MOST_FOLDERS]
+    return [folder / name for name in CaptureFiles(folder).folders() if name and name.count("/") < DEEPEST][:MOST_FOLDERS]
 
 
 def _read_below(folder: Path) -> Capture | None:
     """The only capture in the folders below: of those with poses, else of photos, or a video; None where there is none.
 
-    Several folders of images may be one capture's colour and depth, which only a layout says.
-
-    Raises:
-        InputError: there are several.
+    Several folders of images may be one capture's colour and depth, which only a layout shows.
     """
     found = captures_below(folder)
     if len(found) > 1:
-        names = ", ".join(f"{one.relative_to(folder).as_posix()}/" for one in found[:4])
-        raise InputError(f"{folder} holds {len(found)} captures ({names}{', …' if len(found) > 4 else ''}); give one of them")
+        names = some_of([f"{one.relative_to(folder).as_posix()}/" for one in found], 4)
+        raise InputError(f"{folder} holds {len(found)} captures ({names}); give one of them")
     if not found:
-        found = [below for below in _folders_below(folder) if len(pictures_in(below)) > 1 or len(pictures_in(below, FILMS)) == 1]
-    if len(found) != 1:
-        return None
-    return _descended(folder, found[0])
+        found = [below for below in _folders_below(folder) if len(images_in(below)) > 1 or len(images_in(below, FILMS)) == 1]
+    return _descended(folder, found[0]) if len(found) == 1 else None
 
 
 def _posed_below(folder: Path) -> Capture | None:
@@ -122,8 +112,8 @@ def _descended(folder: Path, below: Path) -> Capture:
 
 
 def _photos_without_film(path: Path) -> bool:
-    """One picture beside a film is its cover, not a capture; and what lies in other folders may have been made of the film."""
-    return len(photo_files(path)) > 1 if pictures_in(path, FILMS) else looks_like_photos(path)
+    """One image beside a film is its cover, not a capture; and what lies in other folders may have been made of the film."""
+    return len(photo_files(path)) > 1 if images_in(path, FILMS) else looks_like_photos(path)
 
 
 READERS: tuple[tuple[str, Callable[[Path], bool], Callable[[Path], Capture]], ...] = (
@@ -160,35 +150,41 @@ def read_source(path: Path) -> Capture:
     path = path.absolute()
     if path.exists():
         require_utf8(path)
-    if path.is_file():
-        if path.suffix.lower() == ".json":
-            return read_blender(path.parent) if path.name.startswith("transforms_") else read_transforms(path)
-        if path.suffix.lower() in (*PICTURES, *CAMERA_RAW):
-            raise InputError(f"{path} is one picture, and one cannot show depth; give the folder that holds all of them")
-        if path.suffix.lower() in ARCHIVES:
-            return _unzipped(path)
-        return read_sens(path) if is_sens(path) else read_video(path)
-    folder = require_folder(path)
+    return _read_file(path) if path.is_file() else _read_folder(require_folder(path))
+
+
+def _read_file(path: Path) -> Capture:
+    suffix = path.suffix.lower()
+    if suffix == ".json":
+        return read_blender(path.parent) if path.name.startswith("transforms_") else read_transforms(path)
+    if suffix in (*IMAGES, *CAMERA_RAW):
+        raise InputError(f"{path} is one image, and one cannot show depth; give the folder that holds all of them")
+    if suffix in ARCHIVES:  # only Record3D's recordings are read from a zip file, since the app itself writes it so
+        if suffix != RECORD3D and not holds_record3d(path):
+            raise InputError(f"{path} is a zip file; unpack it, and give the folder that comes of it")
+        return read_record3d(path)
+    return read_sens(path) if is_sens(path) else read_video(path)
+
+
+def _read_folder(folder: Path) -> Capture:
     try:
         for kind, looks_like, read in READERS:
             if looks_like(folder):
                 return (_posed_below(folder) if kind == "photos" else None) or read(folder)
-        videos = pictures_in(folder, FILMS)
+        videos = images_in(folder, FILMS)
     except OSError as error:
         raise InputError(f"cannot read {error.filename or folder}: {error.strerror or error}") from error
     if len(videos) == 1:
         video = read_source(videos[0])
-        beside = photo_files(folder)
-        remarks = [f"the video {videos[0].name} is used; the one picture beside it, {beside[0].name}, is left out"] if beside else []
-        return replace(video, warnings=(*video.warnings, *remarks))
+        cover = [f"the video {videos[0].name} is used; the one image beside it, {one.name}, is left out" for one in photo_files(folder)[:1]]
+        return video.with_frames(video.frames, *cover)
     if videos:
         raise InputError(f"{folder} holds {len(videos)} videos; give one of them, for instance {videos[0]}")
-    raw = pictures_in(folder, CAMERA_RAW)
+    raw = images_in(folder, CAMERA_RAW)
     if raw:
-        raise InputError(
-            f"{folder} holds {counted(len(raw), 'camera raw file')} ({raw[0].name}{', …' if len(raw) > 1 else ''}), which cannot be read; "
-            "develop them to JPEG, all in the same way"
-        )
+        names = some_of([file.name for file in raw], 1)
+        what = f"{folder} holds {counted(len(raw), 'camera raw file')} ({names}), which cannot be read"
+        raise InputError(f"{what}; develop them to JPEG, all in the same way")
     below = _read_below(folder)
     if below is not None:
         return below
@@ -197,10 +193,3 @@ def read_source(path: Path) -> Capture:
         f"{folder} holds no capture of a known kind (it holds {held}); "
         "give a video, a folder of photos, a phone's recording (.r3d, …), or a posed capture as the README lists"
     )
-
-
-def _unzipped(path: Path) -> Capture:
-    """The recording in a zip file. Only Record3D's is read from one, since the app itself writes it so."""
-    if path.suffix.lower() != RECORD3D and not holds_record3d(path):
-        raise InputError(f"{path} is a zip file; unpack it, and give the folder that comes of it")
-    return read_record3d(path)

@@ -1,4 +1,4 @@
-"""What frames are chosen from: a video, a `.sens` file, or a recording of pictures (`Capture.film`), which may be one zip file."""
+"""What frames are chosen from: a video, a `.sens` file, or a recording of images (`Capture.film`), which may be one zip file."""
 
 from __future__ import annotations
 
@@ -12,23 +12,22 @@ import cv2
 import numpy as np
 
 from fieldfuse.camera import Array
-from fieldfuse.capture.archive import archive_of
-from fieldfuse.capture.headers import read_bytes, read_header
+from fieldfuse.capture.archive import archive_of, read_bytes
+from fieldfuse.capture.headers import read_header
 from fieldfuse.capture.images import load_depth, load_image
-from fieldfuse.capture.sens import JPEG, is_sens, scan
-from fieldfuse.capture.sens_frames import sens_bytes, sens_depth
+from fieldfuse.capture.sens import JPEG, is_sens, scan, sens_bytes, sens_depth
 from fieldfuse.capture.types import Capture, Frame
 from fieldfuse.capture.video import iterate_video
 from fieldfuse.errors import InputError, OutputError
 from fieldfuse.files import atomic_path, fingerprint
 
 QUALITY = 97  # of the JPEG files that a video's frames become
-DEPTH = "depth"  # folder beside the pictures that are written
+DEPTH = "depth"  # folder beside the images that are written
 
 
 @dataclass(frozen=True)
 class Film:
-    """Frames in time order, told by their number: in the video or `.sens` file, of a recording by their place."""
+    """Frames in time order, by their number: in the video or `.sens` file, of a recording by their place."""
 
     path: Path  # the video, or the recording's file or folder
     capture: Capture
@@ -49,7 +48,7 @@ class Film:
 
     @cached_property
     def numbers(self) -> list[int]:
-        """Of the capture's frames, ascending. A `.sens` file's have gaps where a frame has no pose or no picture."""
+        """Of the capture's frames, ascending. A `.sens` file's have gaps where a frame has no pose or no image."""
         return [order if frame.video_index is None else frame.video_index for order, frame in enumerate(self.capture.frames)]
 
     @cached_property
@@ -57,36 +56,27 @@ class Film:
         return dict(zip(self.numbers, self.capture.frames, strict=True))
 
     def state(self) -> list[Any]:
-        """What tells these frames from others; it changes with the files."""
+        """What distinguishes these frames from others; it changes with the files."""
         if not self.capture.film:
             return [self.path, *(["as stored"] if self.as_stored else [])]
         if self.path.is_file():
             return [self.path]
         return [fingerprint(*(path for frame in self.capture.frames for path in (frame.image, frame.depth) if path is not None))]
 
-    def pictures(self, numbers: Collection[int] | None = None) -> Iterator[tuple[int, Array | None]]:
-        """The frames (all, or `numbers`) as (H, W, 3) uint8 RGB, one at a time; None for a recording's picture that is damaged.
-
-        Raises:
-            InputError: the video cannot be opened, or a picture in a `.sens` file is damaged.
-        """
+    def images(self, numbers: Collection[int] | None = None) -> Iterator[tuple[int, Array | None]]:
+        """The frames (all, or `numbers`) as (H, W, 3) uint8 RGB, one at a time; None for a recording's image that is damaged."""
         if not self.capture.film:
             yield from iterate_video(self.path, numbers, as_stored=self.as_stored)
             return
         for number in self.numbers if numbers is None else sorted(numbers):
             try:
-                picture = load_image(self.known[number])[:, :, :3]
-            except InputError:  # one among thousands; where all are, whoever measures them says so
-                picture = None
-            yield number, picture
+                image = load_image(self.known[number])[:, :, :3]
+            except InputError:  # one among thousands; where all are, that is reported when they are measured
+                image = None
+            yield number, image
 
     def jpegs(self, numbers: Collection[int]) -> Iterator[tuple[int, bytes]]:
-        """Frames `numbers` as JPEG files: what is JPEG already stays so, and a video's are made.
-
-        Raises:
-            InputError: a frame is damaged.
-            OutputError: it cannot be encoded.
-        """
+        """Frames `numbers` as JPEG files: what is JPEG already stays so, and a video's are made."""
         if self.capture.film:
             for number in sorted(numbers):
                 image = self.known[number].image
@@ -97,28 +87,23 @@ class Film:
             for number in sorted(numbers):
                 yield number, sens_bytes(scan(self.path), number)
         else:
-            for number, picture in iterate_video(self.path, numbers, as_stored=self.as_stored):
-                quality = [cv2.IMWRITE_JPEG_QUALITY, QUALITY]
-                yield number, _encoded(".jpg", cv2.cvtColor(picture, cv2.COLOR_RGB2BGR), f"frame {number} of {self.path}", quality)
+            for number, rgb in iterate_video(self.path, numbers, as_stored=self.as_stored):
+                bgr = cv2.cvtColor(rgb, cv2.COLOR_RGB2BGR)
+                yield number, _encoded(".jpg", bgr, f"frame {number} of {self.path}", [cv2.IMWRITE_JPEG_QUALITY, QUALITY])
 
-    def depth_at(self, number: int, picture: Path) -> Path | None:
-        """Where the depth of frame `number` is written when its picture is at `picture`; None: it has none, or that is a file already.
+    def depth_at(self, number: int, image: Path) -> Path | None:
+        """Where the depth of frame `number` is written when its image is at `image`; None: it has none, or that is a file already.
 
-        A `.sens` file's stays as it is stored; of a recording it is float32, 0 = missing, what the sensor did not believe left out.
+        A `.sens` file's stays as it is stored; of a recording it is float32, 0 = missing, without what the sensor did not trust.
         """
         if number not in self.known or self.known[number].depth is None or not (self.packed or self.capture.film):
             return None
-        return picture.parent / DEPTH / f"{picture.stem}.{'png' if self.packed else 'npy'}"
+        return image.parent / DEPTH / f"{image.stem}.{'png' if self.packed else 'npy'}"
 
     def write_depth(self, number: int, target: Path) -> None:
-        """Frame `number`'s depth at `target`; nothing where a recording's is damaged.
-
-        Raises:
-            InputError: it is damaged in a `.sens` file.
-            OutputError: it cannot be encoded.
-        """
+        """Frame `number`'s depth at `target`; nothing where a recording's is damaged."""
         if self.packed:
-            data = _encoded(".png", sens_depth(self.path, number), f"the depth of frame {number} of {self.path}")
+            data = _encoded(".png", sens_depth(self.path, number), f"the depth of frame {number} of {self.path}", [])
             with atomic_path(target) as temporary:
                 temporary.write_bytes(data)
             return
@@ -127,22 +112,23 @@ class Film:
         except InputError:
             return
         with atomic_path(target) as temporary:
-            np.save(temporary, depth * np.float32(self.capture.depth_scale))  # in the capture's own unit, as what is read is taken to be
+            np.save(temporary, depth * np.float32(self.capture.depth_scale))  # in the capture's own unit, as it is read
 
-    def written(self, number: int, picture: Path) -> Frame:
-        """Frame `number` as it is now that its picture is at `picture`, and its depth where `depth_at` says."""
+    def written(self, number: int, image: Path) -> Frame:
+        """Frame `number` as it is now that its image is at `image`, and its depth where `depth_at` says."""
         known = self.known.get(number, Frame("", self.path))
-        frame = replace(known, name=picture.stem, image=picture.resolve(), video_index=None, as_stored=False)
-        depth = self.depth_at(number, picture)
+        frame = replace(known, name=image.stem, image=image.resolve(), video_index=None, as_stored=False)
+        depth = self.depth_at(number, image)
         if depth is None:
             return frame
-        if not depth.is_file():
-            return replace(frame, depth=None, depth_intrinsics=None, confidence=None)
-        return replace(frame, depth=depth.resolve(), confidence=None)
+        there = depth.is_file()
+        return replace(
+            frame, depth=depth.resolve() if there else None, depth_intrinsics=frame.depth_intrinsics if there else None, confidence=None
+        )
 
 
-def _encoded(suffix: str, picture: Array, what: str, settings: list[int] | None = None) -> bytes:
-    coded, data = cv2.imencode(suffix, picture, settings or [])
+def _encoded(suffix: str, image: Array, what: str, settings: list[int]) -> bytes:
+    coded, data = cv2.imencode(suffix, image, settings)
     if not coded:
         raise OutputError(f"{what} cannot be encoded as {'JPEG' if suffix == '.jpg' else 'PNG'}")
     return data.tobytes()

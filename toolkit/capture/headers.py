@@ -1,167 +1,243 @@
-"""What the header of a picture file says, and whether the file is whole, before anything is decoded."""
+"""Headers of image files: format, size, EXIF orientation, colour profile, and whether the file is whole, before anything is decoded."""
 
 from __future__ import annotations
 
 import io
+import struct
 import threading
 import warnings
+from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import BinaryIO
 
+import numpy as np
 from PIL import Image, UnidentifiedImageError
+from PIL.TiffImagePlugin import ImageFileDirectory_v2
 
 from fieldfuse.capture import heif
-from fieldfuse.capture.archive import read_member
-from fieldfuse.capture.primaries import heif_colours, png_colours
-from fieldfuse.capture.tiff import Tiff, is_tiff, read_tiff, unturned
+from fieldfuse.capture.colours import png_colours, profile_of
+from fieldfuse.capture.poses import reads_leniently
 from fieldfuse.errors import InputError
 
 MAX_PIXELS = 200_000_000
 PANORAMA = "360° panoramas (equirectangular) are not read; cut each into perspective views first, and give these"
-XMP_WITHIN = 2**18  # bytes of a file's beginning in which its XMP stands
-PNG_BITS = 24  # where a PNG's bit depth stands
-EXR = b"\x76\x2f\x31\x01"
 NOT_EXR = "is OpenEXR, which is not read; write depth as 16-bit PNG in millimetres or as float .npy, and images as PNG or TIFF"
-_ORIENTATION = 0x0112  # EXIF tag, 1 to 8
+LYING = 5  # EXIF orientations from here on turn by 90°
+TIFFS = (".tif", ".tiff")
+WIDTH, HEIGHT, BITS, ORIENTATION, MAXIMUM, EXTRA, SAMPLE_FORMAT, PROFILE = 256, 257, 258, 274, 281, 338, 339, 34675  # tags of TIFF 6.0
 _pillow_limit = threading.Lock()
 
 
 @dataclass(frozen=True)
 class Header:
-    """Stored size (before any EXIF turn; of HEIF as it is seen), file format in Pillow's name for it, EXIF orientation (1: as stored), and
-    the ICC profile of its colours, if it says what they are."""
+    """An image as stored, before any EXIF turn (HEIF: as it is seen)."""
 
     width: int
     height: int
-    format: str
-    orientation: int
-    profile: bytes | None = None
+    format: str  # Pillow's name for it
+    orientation: int = 1  # by EXIF; 1: as stored
+    profile: bytes | None = None  # ICC, of its colours
     deep: bool = False  # more than 8 bits a channel
-    white: int | None = None  # the largest value that a channel has, where the file says so
+    white: int | None = None  # the largest value that a channel has, where the file gives it
     floating: bool = False  # channels are floating-point numbers
+    alpha: bool = False
+
+    @property
+    def size(self) -> tuple[int, int]:
+        return self.width, self.height
 
 
-def read_bytes(path: Path) -> bytes:
-    """The whole file, which may be a zip file's member (see `archive`).
-
-    Raises:
-        InputError: missing, unreadable or empty.
-    """
-    try:
-        data = Path(path).read_bytes()
-    except NotADirectoryError:
-        data = read_member(Path(path))
-    except OSError as error:
-        raise InputError(f"cannot read the picture {path}: {error.strerror or error}") from error
-    if not data:
-        raise InputError(f"the picture {path} is empty (0 bytes); copy it again or remove it")
-    return data
+UNREADABLE = Header(0, 0, "")  # of a file that cannot be read, while a capture is: the first look at all images excludes it
 
 
 def read_header(data: bytes, path: Path) -> Header:
-    """Size, format and orientation of the picture in `data` (of the file `path`), with nothing decoded.
+    """The header of the image in `data` (of the file `path`).
 
     Raises:
-        InputError: not a picture, more than `MAX_PIXELS` pixels, the file ends before the picture does, or what reads HEIF is not there.
+        InputError: not an image, more than `MAX_PIXELS` pixels, the file ends before the image does, or pillow-heif is not installed.
     """
+    cut_short = InputError(f"the image {path} is cut short (the file ends before the image does); copy it again or remove it")
     if heif.is_heif(data):
         heif.register(path)
-    if (heif.is_heif(data) or is_avif(data)) and not heif.complete(data):
-        raise _cut_short(path)
-    if data[:4] == EXR:
+    if heif.is_heif(data) or data[4:12] in (b"ftypavif", b"ftypavis"):
+        end = end_of_boxes(io.BytesIO(data), len(data))
+        if end is not None and end > len(data):
+            raise cut_short
+    if data[:4] == b"\x76\x2f\x31\x01":
         raise InputError(f"{path} {NOT_EXR}")
-    tiff = read_tiff(data) if is_tiff(data) else None
+    header = read_tiff(data)
     try:
         # Pillow's own limit is lower than ours and global; it is lifted for the header only, and ours is applied below.
         with _pillow_limit, warnings.catch_warnings():
             warnings.simplefilter("ignore")
             limit, Image.MAX_IMAGE_PIXELS = Image.MAX_IMAGE_PIXELS, None
             try:
-                with Image.open(io.BytesIO(unturned(data))) as picture:
-                    width, height = picture.size
-                    kind = picture.format or ""
-                    orientation = _orientation(picture) if tiff is None else tiff.orientation
-                    profile = _profile(picture, data)
-                    deep = picture.mode.startswith("I") or (tiff is not None and tiff.bits > 8)
+                with Image.open(io.BytesIO(unturned(data))) as image:
+                    kind, deep = image.format or "", image.mode.startswith("I") or (image.format == "PNG" and data[24:25] == b"\x10")
+                    if header is None:
+                        header = Header(*image.size, kind, _orientation(image), _profile(image, data), deep)
             finally:
                 Image.MAX_IMAGE_PIXELS = limit
     except UnidentifiedImageError as error:
-        if tiff is not None:
-            return _of_tiff(tiff, path)
-        raise InputError(f"{path} is not a picture that can be read; convert it to JPEG or PNG, or remove it") from error
+        if header is None:  # Pillow reads no TIFF of 32-bit floating-point colours
+            raise InputError(f"{path} is not an image that can be read; convert it to JPEG or PNG, or remove it") from error
     except Exception as error:  # Pillow's parsers raise many families on damaged headers
-        raise InputError(f"the header of the picture {path} is damaged; copy it again or remove it") from error
-    _check_size(width, height, path)
-    if not _complete(data, kind):
-        raise _cut_short(path)
-    deep = deep or (kind == "PNG" and len(data) > PNG_BITS and data[PNG_BITS] == 16)
-    white, floating = (None, False) if tiff is None else (tiff.maximum, tiff.floating)
-    return Header(width, height, kind, orientation, profile, deep, white, floating)
+        raise InputError(f"the header of the image {path} is damaged; copy it again or remove it") from error
+    width, height = header.size
+    if width * height > MAX_PIXELS:
+        most = f"{MAX_PIXELS // 10**6} megapixels"
+        raise InputError(f"the image {path} has {width}×{height} pixels, more than the {most} that are read; make it smaller")
+    if width < 1 or height < 1:
+        raise InputError(f"the image {path} has no pixels ({width}×{height}); remove it")
+    if not _complete(data, header.format):
+        raise cut_short
+    return header
+
+
+def image_header(path: Path) -> Header:
+    """Size and alpha of an image (or the shape of a 2-D `.npy`), with little of the file read. While a capture is read, a file that
+    cannot be read is `UNREADABLE`: whether that refuses the capture is decided when all are known.
+
+    Raises:
+        InputError: not an image that can be read.
+    """
+    if heif.file_is_heif(path):
+        heif.register(path)
+    suffix = path.suffix.lower()
+    if suffix == ".exr":
+        raise InputError(f"{path} {NOT_EXR}")
+    try:
+        if suffix == ".npy":
+            height, width = np.load(path, mmap_mode="r", allow_pickle=False).shape[:2]
+            return Header(int(width), int(height), "NPY")
+        if suffix in TIFFS and (tiff := read_tiff(path.read_bytes())) is not None:
+            return tiff
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore", Image.DecompressionBombWarning)  # only the header is read; large photos are welcome
+            image = Image.open(path)
+        with image:
+            alpha = image.mode in ("RGBA", "LA", "PA", "RGBa", "La") or "transparency" in image.info
+            return Header(*image.size, image.format or "", alpha=alpha)
+    except Exception as error:  # Pillow's and NumPy's parsers raise many families on broken files
+        if reads_leniently():
+            return UNREADABLE
+        raise InputError(f"{path} cannot be read as an image; remove it or replace it") from error
+
+
+def image_size(path: Path, others: Sequence[Path] = ()) -> tuple[int, int]:
+    """Size (width, height) of an image; where it cannot be read, that of the first of the `others` that can."""
+    sizes = (image_header(one).size for one in (path, *others))
+    size = next((size for size in sizes if size != UNREADABLE.size), None)
+    if size is None:
+        raise InputError(f"{path} cannot be read as an image, and neither can the others beside it; check how they were written")
+    return size
 
 
 def is_panorama(data: bytes, header: Header, posed: bool) -> bool:
-    """Whether the file says that its image is equirectangular (Google's photo sphere XMP). Of `posed` images those alone are such that are
-    twice as wide as high: views that were cut out of a panorama may have kept its XMP."""
-    head = data[:XMP_WITHIN]
+    """Whether the file has Google's photo sphere XMP (equirectangular). Of `posed` images only those twice as wide as high count: views
+    cut from a panorama may have kept its XMP."""
+    head = data[: 2**18]
     return b"GPano:" in head and b"equirectangular" in head and (not posed or header.width == 2 * header.height)
 
 
-def is_avif(data: bytes) -> bool:
-    return data[4:8] == b"ftyp" and data[8:12] in (b"avif", b"avis")
-
-
-def _of_tiff(tiff: Tiff, path: Path) -> Header:
-    """Of a TIFF that Pillow does not know, as those with 32-bit floating-point colours."""
-    _check_size(tiff.width, tiff.height, path)
-    return Header(tiff.width, tiff.height, "TIFF", tiff.orientation, tiff.profile, tiff.bits > 8, tiff.maximum, tiff.floating)
-
-
-def _check_size(width: int, height: int, path: Path) -> None:
-    if width * height > MAX_PIXELS:
-        raise InputError(
-            f"the picture {path} has {width}×{height} pixels, more than the {MAX_PIXELS // 10**6} megapixels that are read; make it smaller"
-        )
-    if width < 1 or height < 1:
-        raise InputError(f"the picture {path} has no pixels ({width}×{height}); remove it")
-
-
 def orientation_of(path: Path) -> int:
-    """The EXIF orientation by which the picture in a file is to be turned, with only its header read. 1 also for HEIF, which is decoded as
-    it is to be seen, and for a file that cannot be read, which whoever reads it will tell."""
+    """The EXIF orientation of an image file, with only its header read. 1 also for HEIF, which is decoded upright, and for a file that
+    cannot be read, which is reported where it is decoded."""
     if heif.file_is_heif(path):
         return 1
     try:
-        if path.suffix.lower() in (".tif", ".tiff") and (tiff := read_tiff(path.read_bytes())) is not None:
+        if path.suffix.lower() in TIFFS and (tiff := read_tiff(path.read_bytes())) is not None:
             return tiff.orientation
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")
-            with Image.open(path) as picture:
+            with Image.open(path) as image:
                 # Of a PNG, Pillow looks behind the pixels, and decodes them for that; with this it does where there is something to find.
-                found = picture.format != "PNG" or b"exif" in path.read_bytes().lower()
-                return _orientation(picture) if found else 1
+                found = image.format != "PNG" or b"exif" in path.read_bytes().lower()
+                return _orientation(image) if found else 1
     except Exception:  # Pillow's parsers raise many families on damaged headers
         return 1
 
 
-def _cut_short(path: Path) -> InputError:
-    return InputError(f"the picture {path} is cut short (the file ends before the picture does); copy it again or remove it")
-
-
-def _profile(picture: Image.Image, data: bytes) -> bytes | None:
-    """Of its colours: in an ICC profile, or by number, which PNG's chunk says before the profile and HEIF's box after it."""
-    icc = picture.info.get("icc_profile")
-    icc = icc if isinstance(icc, bytes) and icc else None
-    if picture.format == "PNG":
-        return png_colours(data) or icc
-    return icc or heif_colours(picture.info.get("nclx_profile"))
-
-
-def _orientation(picture: Image.Image) -> int:
+def _orientation(image: Image.Image) -> int:
     try:
-        value = int(picture.getexif().get(_ORIENTATION, 1))
-    except Exception:  # damaged EXIF raises about anything, and a picture is usable without it
+        value = int(image.getexif().get(ORIENTATION, 1))
+    except Exception:  # damaged EXIF raises about anything, and an image is usable without it
         return 1
     return value if 1 <= value <= 8 else 1
+
+
+def _profile(image: Image.Image, data: bytes) -> bytes | None:
+    icc = image.info.get("icc_profile")
+    icc = icc if isinstance(icc, bytes) and icc else None
+    if image.format == "PNG":
+        return png_colours(data) or icc
+    box = image.info.get("nclx_profile")
+    return icc or (profile_of(box.get("color_primaries"), box.get("transfer_characteristics")) if isinstance(box, dict) else None)
+
+
+# ------------------------------------------------------------------------------------------------ TIFF
+
+
+def read_tiff(data: bytes) -> Header | None:
+    """The first image of a TIFF; None where it is damaged, or there is none."""
+    found = _directory(data)
+    if found is None:
+        return None
+
+    def values(tag: int) -> tuple[int, ...]:
+        value = found[0].get(tag, ())
+        return tuple(int(one) for one in value) if isinstance(value, tuple) else (int(value),)
+
+    try:
+        bits, orientation, most, profile = values(BITS), values(ORIENTATION), values(MAXIMUM), found[0].get(PROFILE)
+        return Header(
+            values(WIDTH)[0],
+            values(HEIGHT)[0],
+            "TIFF",
+            orientation[0] if orientation and 1 <= orientation[0] <= 8 else 1,
+            profile if isinstance(profile, bytes) else None,
+            max(bits, default=1) > 8,
+            max(most) if most else None,
+            3 in values(SAMPLE_FORMAT),
+            any(kind in (1, 2) for kind in values(EXTRA)),
+        )
+    except Exception:  # Pillow decodes values when they are asked for, and raises many families on damaged ones
+        return None
+
+
+def unturned(data: bytes) -> bytes:
+    """The file with its orientation removed if it is a TIFF: Pillow and OpenCV turn these, whatever they are asked for."""
+    header = read_tiff(data)
+    found = _directory(data)
+    if header is None or found is None or header.orientation == 1:
+        return data
+    order, big = ("<" if data[:2] == b"II" else ">"), data[2:4] == b"+\0"
+    at = data.find(struct.pack(order + ("HHQ" if big else "HHI"), ORIENTATION, 3, 1), found[1])
+    if at < 0:
+        return data
+    at += 12 if big else 8
+    return data[:at] + struct.pack(order + "H", 1) + data[at + 2 :]
+
+
+def _directory(data: bytes) -> tuple[ImageFileDirectory_v2, int] | None:
+    """The first directory of a TIFF and where it begins; None where the file is another, or damaged."""
+    if data[:4] not in (b"II*\0", b"MM\0*", b"II+\0"):
+        return None
+    stream = io.BytesIO(data)
+    try:
+        directory = ImageFileDirectory_v2(stream.read(16 if data[2:4] == b"+\0" else 8))
+        at = int(directory.next)
+        stream.seek(at)
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore")
+            directory.load(stream)
+    except Exception:  # Pillow's parsers raise many families on damaged files
+        return None
+    return directory, at
+
+
+# ------------------------------------------------------------------------------------------------ is the file whole
 
 
 def _complete(data: bytes, kind: str) -> bool:
@@ -175,7 +251,7 @@ def _complete(data: bytes, kind: str) -> bool:
 
 
 def _jpeg_ends(data: bytes) -> bool:
-    """Whether an end-of-image marker follows the picture's own data (ITU T.81, B.1.1).
+    """Whether an end-of-image marker follows the image's own data (ITU T.81, B.1.1).
 
     Segments are walked up to the first scan, because EXIF holds a thumbnail with an end marker of its own. Bytes behind the
     marker (motion photos, padding) are allowed.
@@ -194,3 +270,21 @@ def _jpeg_ends(data: bytes) -> bool:
         else:
             position += 2 + int.from_bytes(data[position + 2 : position + 4], "big")
     return False
+
+
+def end_of_boxes(file: BinaryIO, size: int) -> int | None:
+    """Where the last box of an ISO base media file (mp4, mov, HEIF, AVIF) ends by its own word (ISO/IEC 14496-12, 4.2); None: it has none.
+
+    A box has a 32-bit size, a type, and a 64-bit size when the first is 1.
+    """
+    position = 0
+    while position + 8 <= size:
+        file.seek(position)
+        header = file.read(16)
+        length = int.from_bytes(header[:4], "big")
+        if length == 1 and len(header) == 16:
+            length = int.from_bytes(header[8:16], "big")
+        if length < 8 or not header[4:8].isascii():  # "to the end of the file", padding or junk behind the last box
+            return None
+        position += length
+    return position

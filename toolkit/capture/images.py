@@ -1,129 +1,100 @@
-"""Pixels of a frame: the picture as RGB(A), its depth in the input's units, its mask. Nothing is resized or undistorted here."""
+"""Pixels of a frame: the image as RGB(A), its depth in the input's units, its mask. Nothing is resized or undistorted here."""
 
 from __future__ import annotations
 
 import io
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
+from contextlib import suppress
 from pathlib import Path
+from typing import Any, TypeVar
 
 import cv2
 import numpy as np
 from PIL import Image
 
 from fieldfuse.camera import Array
-from fieldfuse.capture import heif, lzfse
+from fieldfuse.capture import heif
+from fieldfuse.capture.archive import MAPS, load_map, read_bytes
 from fieldfuse.capture.colours import to_srgb
-from fieldfuse.capture.headers import MAX_PIXELS, Header, orientation_of, read_bytes, read_header
-from fieldfuse.capture.sens import is_sens
-from fieldfuse.capture.sens_frames import sens_depth
-from fieldfuse.capture.sizes import picture_header
-from fieldfuse.capture.tiff import unturned
+from fieldfuse.capture.headers import LYING, MAX_PIXELS, Header, image_header, orientation_of, read_header, unturned
+from fieldfuse.capture.sens import is_sens, sens_depth
 from fieldfuse.capture.types import Capture, Frame
 from fieldfuse.capture.video import iterate_video
 from fieldfuse.errors import InputError
 
 EXIF_TURNS = "exif_turns"  # in `Capture.extra`: the cameras are those of images that are turned by EXIF
 LOSSY = ("JPEG", "MPO", "WEBP", heif.FORMAT)  # formats whose black and white come out as greys
-WHITE = 255
 FEW_LEVELS = 32  # grey levels of a mask up to which they are labels, not soft edges
-HEADERS, PICTURES = 100, 5  # looked at at most, evenly spread: decoding all of a large capture would take minutes
+HEADERS, IMAGES = 100, 5  # looked at at most, evenly spread: decoding all of a large capture would take minutes
+T = TypeVar("T")
+
+
+def spread(values: Sequence[T], most: int) -> list[T]:
+    """At most `most` of the values, evenly spread, the first and the last among them."""
+    return [values[int(at)] for at in np.unique(np.linspace(0, len(values) - 1, most).round())] if len(values) else []
 
 
 def turns_by_exif(capture: Capture) -> bool:
-    """Whether this capture's pictures are turned upright by their EXIF orientation.
+    """Whether this capture's images are turned upright by their EXIF orientation.
 
-    Plain photo folders are. Other sources bring cameras that were made for the pixels as they are stored, unless only the turned images
+    Plain photo folders are. Other sources have cameras that were made for the pixels as they are stored, unless only the turned images
     have the cameras' shape (`usable.turned_by_exif`).
     """
     return capture.kind == "photos" or capture.extra.get(EXIF_TURNS) is True
 
 
 def load_image(frame: Frame, *, exif: bool = False) -> Array:
-    """The frame's picture, (H, W, 3) or with alpha (H, W, 4), uint8 RGB(A), alpha not premultiplied.
+    """The frame's image, (H, W, 3) or with alpha (H, W, 4), uint8 RGB(A), alpha not premultiplied.
 
-    Grey pictures become RGB; 16-bit ones are rounded to 8 bits; floating-point ones are taken as 0 to 1. Colours are sRGB's, whatever
-    profile the file has. A mask that is alpha (`mask_is_alpha`) becomes the picture's. With `exif` the EXIF orientation is applied (see
+    Grey images become RGB; 16-bit ones are rounded to 8 bits; floating-point ones are taken as 0 to 1. Colours are sRGB's, whatever
+    profile the file has. A mask that is alpha (`mask_is_alpha`) becomes the image's. With `exif` the EXIF orientation is applied (see
     `turns_by_exif`), without it the pixels stay as stored.
 
     Raises:
-        InputError: naming the file, when it is missing, no picture, cut short or too large.
+        InputError: naming the file, when it is missing, no image, cut short or too large.
     """
     if frame.video_index is not None:
-        for _, picture in iterate_video(frame.image, {frame.video_index}, as_stored=frame.as_stored):
-            return picture
+        for _, image in iterate_video(frame.image, {frame.video_index}, as_stored=frame.as_stored):
+            return image
         raise InputError(f"frame {frame.video_index} of the video {frame.image} cannot be decoded; the file may be damaged")
-    stored, orientation = read_picture(frame.image, frame.white)
-    picture = upright(stored, orientation if exif else 1)
+    stored, orientation = read_image(frame.image, frame.white)
+    image = upright(stored, orientation if exif else 1)
     mask = load_mask(frame, exif=exif) if frame.mask_is_alpha else None
-    if mask is None or picture.shape[2] == 4:
-        return picture
-    return np.dstack([picture, cv2.resize(mask.astype(np.uint8) * 255, picture.shape[1::-1], interpolation=cv2.INTER_LINEAR)])
+    if mask is None or image.shape[2] == 4:
+        return image
+    return np.dstack([image, cv2.resize(mask.astype(np.uint8) * 255, image.shape[1::-1], interpolation=cv2.INTER_LINEAR)])
 
 
-def read_picture(path: Path, white: int | None = None) -> tuple[Array, int]:
-    """The picture in the file `path` as `load_image` has it, pixels as stored, and the EXIF orientation.
-
-    Args:
-        white: the largest value of its channels, as `Frame.white`.
-
-    Raises:
-        InputError: naming the file.
-    """
-    picture, header = decode(path)
-    return to_srgb(to_rgba(picture, white), header.profile), 1 if header.format == heif.FORMAT else header.orientation
-
-
-def largest(path: Path) -> int:
-    """The largest value of a 16-bit image's channels, alpha aside; 0 for other images.
-
-    Raises:
-        InputError: naming the file.
-    """
-    image = decode(path)[0]
-    return int(image[..., :3].max() if image.ndim == 3 else image.max()) if image.dtype == np.uint16 else 0
-
-
-def see_through(path: Path) -> bool:
-    """Whether some pixel of a picture is not opaque.
-
-    Raises:
-        InputError: naming the file.
-    """
-    picture = to_rgba(decode(path)[0])
-    return picture.shape[2] == 4 and bool((picture[:, :, 3] < 255).any())
+def read_image(path: Path, white: int | None = None) -> tuple[Array, int]:
+    """The image in the file `path` as `load_image` has it, pixels as stored, and the EXIF orientation; `white` as `Frame.white`."""
+    image, header = decode(path)
+    return to_srgb(to_rgba(image, white), header.profile), 1 if header.format == heif.FORMAT else header.orientation
 
 
 def cut_out(frames: Sequence[Frame]) -> bool:
     """Whether alpha cuts an object out of a capture's images: some pixel of those looked at is not opaque. Screenshots and many programs'
     PNGs have an alpha that is full everywhere. Files that cannot be read are reported when all pixels are read."""
-    paths = [frame.image for frame in frames if frame.video_index is None]
-    with_alpha = [path for path in _spread(paths, HEADERS) if _tells(_has_alpha, path)]
-    return any(_tells(see_through, path) for path in _spread(with_alpha, PICTURES))
-
-
-def _has_alpha(path: Path) -> bool:
-    return picture_header(path).alpha
-
-
-def _tells(question: Callable[[Path], bool], path: Path) -> bool:
-    try:
-        return question(path)
-    except InputError:
-        return False
-
-
-def _spread(paths: list[Path], most: int) -> list[Path]:
-    return [paths[int(place)] for place in np.unique(np.linspace(0, len(paths) - 1, most).round())] if paths else []
+    with_alpha = []
+    for frame in spread([frame for frame in frames if frame.video_index is None], HEADERS):
+        with suppress(InputError):
+            if image_header(frame.image).alpha:
+                with_alpha.append(frame.image)
+    for path in spread(with_alpha, IMAGES):
+        with suppress(InputError):
+            image = to_rgba(decode(path)[0])
+            if image.shape[2] == 4 and (image[:, :, 3] < 255).any():
+                return True
+    return False
 
 
 def load_depth(frame: Frame, capture: Capture) -> Array:
     """The frame's depth map, (H, W) float32 along z in units of the input's poses, 0 = missing.
 
-    Stored values are divided by `capture.depth_scale`. 0, negative, NaN and infinite values are missing, so is 65535 in 16-bit pictures,
-    and so is where the frame's confidence is 0. Where the depth camera stands beside the picture's, the map is carried to where that
-    stands (`carried`). Read are 8/16-bit PNG, TIFF and PFM with whole or floating-point numbers, .npy arrays, LZFSE (`lzfse`), and what
-    `.sens` files hold.
+    Stored values are divided by `capture.depth_scale`. 0, negative, NaN and infinite values are missing, so is 65535 in 16-bit images,
+    and so is where the frame's confidence is 0. Where the depth camera stands beside the image's, the map is reprojected into that
+    (`depth_reprojection`). Read are 8/16-bit PNG, TIFF and PFM with whole or floating-point numbers, .npy arrays, LZFSE (`archive`), and
+    what `.sens` files hold.
 
     Raises:
         InputError: naming the file, when it is missing, damaged, or not one value a pixel.
@@ -156,16 +127,16 @@ def load_depth(frame: Frame, capture: Capture) -> Array:
     camera = frame.depth_intrinsics or frame.intrinsics
     if frame.depth_pose is None or camera is None:
         return depth
-    from fieldfuse.capture.carried import carried  # here: its kernels take a second to load, and few captures need them
+    from fieldfuse.capture.depth_reprojection import reprojected  # here: its kernels take a second to load, and few captures need them
 
     height, width = depth.shape
-    return carried(depth, camera.scaled(width, height), frame.depth_pose)
+    return reprojected(depth, camera.scaled(width, height), frame.depth_pose)
 
 
 def load_mask(frame: Frame, *, exif: bool = False) -> Array | None:
     """(H, W) bool, True where the pixel may be used; None when the frame has no mask. A mask may have another size than its image.
 
-    Left out is what is 0 in every channel (what is not, where `frame.mask_excludes`). Masks with soft edges, and those of a lossy format,
+    Excluded is what is 0 in every channel (what is not, where `frame.mask_excludes`). Masks with soft edges, and those of a lossy format,
     are cut at half of white. Alpha that is not the same everywhere is the mask, whatever the colours are. With `exif` the mask is turned
     as its image is: by its own orientation or, if only its image has one and it fits no other way, by that.
 
@@ -179,25 +150,25 @@ def load_mask(frame: Frame, *, exif: bool = False) -> Array | None:
     if exif:
         mask = upright(mask, 1 if header.format == heif.FORMAT else header.orientation)
         orientation = orientation_of(frame.image)
-        if orientation >= 5:
-            width, height = picture_header(frame.image).size
+        if orientation >= LYING:
+            width, height = image_header(frame.image).size
             as_stored, turned = (abs(math.log(mask.shape[1] * b / (mask.shape[0] * a))) for a, b in ((width, height), (height, width)))
             mask = upright(mask, orientation) if as_stored < turned else mask
     return np.asarray(mask != frame.mask_excludes)
 
 
-def usable_pixels(frame: Frame, picture: Array, *, exif: bool = False) -> Array | None:
-    """(H, W) bool: pixels of the frame's `picture` (H, W, 3 or 4) that its mask allows and that are not see-through; None: all.
+def usable_pixels(frame: Frame, image: Array, *, exif: bool = False) -> Array | None:
+    """(H, W) bool: pixels of the frame's `image` (H, W, 3 or 4) that its mask allows and that are not see-through; None: all.
 
     Raises:
         InputError: as `load_mask`.
     """
-    height, width = picture.shape[:2]
+    height, width = image.shape[:2]
     usable = load_mask(frame, exif=exif)
     if usable is not None and usable.shape != (height, width):
         usable = np.asarray(cv2.resize(usable.astype(np.uint8), (width, height), interpolation=cv2.INTER_NEAREST) > 0)
-    if picture.shape[2] == 4:
-        opaque = picture[:, :, 3] >= 128
+    if image.shape[2] == 4:
+        opaque = image[:, :, 3] >= 128
         usable = opaque if usable is None else usable & opaque
     return usable
 
@@ -210,49 +181,49 @@ def _white(mask: Array, lossy: bool) -> Array:
             return np.asarray(alpha > alpha.max() / 2)
     grey = mask if mask.ndim == 2 else mask[:, :, :3].max(axis=2)
     if lossy:
-        return np.asarray(grey > WHITE / 2)
+        return np.asarray(grey > 255 / 2)
     soft = grey.dtype.kind == "f" or np.count_nonzero(np.bincount(grey.ravel())) > FEW_LEVELS
     return np.asarray(grey > grey.max() / 2 if soft else grey > 0)
 
 
-def to_rgba(picture: Array, white: int | None = None) -> Array:
-    """A decoded picture of any depth and number of channels (BGR order) → (H, W, 3) or (H, W, 4) uint8 RGB(A).
+def to_rgba(image: Array, white: int | None = None) -> Array:
+    """A decoded image of any depth and number of channels (BGR order) → (H, W, 3) or (H, W, 4) uint8 RGB(A).
 
     Args:
         white: the value of 16-bit or floating-point channels that becomes 255; None: 65535, or 1. Alpha of 16 bits always uses all.
     """
-    if picture.dtype == np.uint16:
-        alpha = picture[..., 3:] if white is not None and picture.ndim == 3 and picture.shape[2] == 4 else None
-        picture = cv2.convertScaleAbs(picture, alpha=255 / (white or 65535))
+    if image.dtype == np.uint16:
+        alpha = image[..., 3:] if white is not None and image.ndim == 3 and image.shape[2] == 4 else None
+        image = cv2.convertScaleAbs(image, alpha=255 / (white or 65535))
         if alpha is not None:
-            picture[..., 3:] = alpha >> 8
-    elif picture.dtype != np.uint8:
+            image[..., 3:] = alpha >> 8
+    elif image.dtype != np.uint8:
         top = white or 1
-        finite = np.nan_to_num(picture.astype(np.float32), nan=0.0, posinf=top, neginf=0.0)
-        picture = np.round(np.clip(finite / np.float32(top), 0, 1) * 255).astype(np.uint8)
-    if picture.ndim == 3 and picture.shape[2] == 1:
-        picture = picture[:, :, 0]
-    if picture.ndim == 2:
-        return np.asarray(cv2.cvtColor(picture, cv2.COLOR_GRAY2RGB))
-    return np.asarray(cv2.cvtColor(picture, cv2.COLOR_BGRA2RGBA if picture.shape[2] == 4 else cv2.COLOR_BGR2RGB))
+        finite = np.nan_to_num(image.astype(np.float32), nan=0.0, posinf=top, neginf=0.0)
+        image = np.round(np.clip(finite / np.float32(top), 0, 1) * 255).astype(np.uint8)
+    if image.ndim == 3 and image.shape[2] == 1:
+        image = image[:, :, 0]
+    if image.ndim == 2:
+        return np.asarray(cv2.cvtColor(image, cv2.COLOR_GRAY2RGB))
+    return np.asarray(cv2.cvtColor(image, cv2.COLOR_BGRA2RGBA if image.shape[2] == 4 else cv2.COLOR_BGR2RGB))
 
 
-def upright(picture: Array, orientation: int) -> Array:
+def upright(image: Array, orientation: int) -> Array:
     """Apply an EXIF orientation (1 to 8, TIFF 6.0 tag 274) to (H, W, ...) pixels."""
     if orientation in (5, 6, 7, 8):
-        picture = picture.swapaxes(0, 1)
+        image = image.swapaxes(0, 1)
     if orientation in (3, 4, 7, 8):
-        picture = picture[::-1]
+        image = image[::-1]
     if orientation in (2, 3, 6, 7):
-        picture = picture[:, ::-1]
-    return np.ascontiguousarray(picture)
+        image = image[:, ::-1]
+    return np.ascontiguousarray(image)
 
 
 def _values(path: Path, frame: Frame) -> Array:
     """What the file of a depth map, or of its confidence, holds."""
     camera = frame.depth_intrinsics
-    if path.suffix.lower() in lzfse.TYPES and camera is not None:
-        return lzfse.load_map(path, camera.width, camera.height)
+    if path.suffix.lower() in MAPS and camera is not None:
+        return load_map(path, camera.width, camera.height)
     return decode(path)[0]
 
 
@@ -262,29 +233,22 @@ def decode(path: Path) -> tuple[Array, Header]:
     header = read_header(data, path)
     if header.format == heif.FORMAT:
         return heif.decode(data, path), header
-    if header.format == "AVIF":
-        return _decode_avif(data, path), header
+    image: Any = None
     try:
-        # UNCHANGED keeps alpha and 16 bits, and leaves the orientation to us; TIFFs would be turned all the same.
-        picture = cv2.imdecode(np.frombuffer(unturned(data), np.uint8), cv2.IMREAD_UNCHANGED)
-    except cv2.error:
-        picture = None
-    if picture is None:
+        if header.format == "AVIF":  # OpenCV reads more than 8 bits in a range of their own
+            with Image.open(io.BytesIO(data)) as opened:
+                rgb = np.asarray(opened.convert("RGBA" if opened.mode in ("RGBA", "LA") else "RGB"))
+            image = cv2.cvtColor(rgb, cv2.COLOR_RGBA2BGRA if rgb.shape[2] == 4 else cv2.COLOR_RGB2BGR)
+        else:
+            # UNCHANGED keeps alpha and 16 bits, and leaves the orientation to us; TIFFs would be turned all the same.
+            image = cv2.imdecode(np.frombuffer(unturned(data), np.uint8), cv2.IMREAD_UNCHANGED)
+    except Exception:  # Pillow's decoders raise many families on damaged files
+        image = None
+    if image is None:
         raise InputError(
-            f"the picture {path} ({header.format}) is damaged or of a kind that cannot be decoded; copy it again or convert it to PNG"
+            f"the image {path} ({header.format}) is damaged or of a kind that cannot be decoded; copy it again or convert it to PNG"
         )
-    return np.asarray(picture), header
-
-
-def _decode_avif(data: bytes, path: Path) -> Array:
-    """(H, W, 3 or 4) uint8 in OpenCV's order: OpenCV itself reads more than 8 bits in a range of their own."""
-    try:
-        with Image.open(io.BytesIO(data)) as picture:
-            picture.load()
-            rgb = np.asarray(picture.convert("RGBA" if picture.mode in ("RGBA", "LA") else "RGB"))
-    except Exception as error:  # Pillow's decoders raise many families on damaged files
-        raise InputError(f"the picture {path} (AVIF) is damaged or cannot be decoded; copy it again or convert it to PNG") from error
-    return np.asarray(cv2.cvtColor(rgb, cv2.COLOR_RGBA2BGRA if rgb.shape[2] == 4 else cv2.COLOR_RGB2BGR))
+    return np.asarray(image), header
 
 
 def _load_npy(path: Path) -> Array:

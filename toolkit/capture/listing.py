@@ -1,9 +1,9 @@
-"""What all readers share: natural order, small text files, unique names, frames with depth, and the checks at the end."""
+"""What all readers share: natural order, unique names, small text and JSON files, and the checks at the end."""
 
 from __future__ import annotations
 
 import re
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -11,15 +11,14 @@ from typing import Any
 import numpy as np
 
 from fieldfuse import files
-from fieldfuse.camera import Array, Intrinsics
+from fieldfuse.camera import Array
 from fieldfuse.capture import heif
 from fieldfuse.capture.images import cut_out
-from fieldfuse.capture.poses import checked_pose, unread_frames
-from fieldfuse.capture.sizes import fitted, picture_header
+from fieldfuse.capture.poses import unread_frames
 from fieldfuse.capture.types import Capture, Frame
 from fieldfuse.errors import InputError, first_line
 
-PICTURES = (".jpg", ".jpeg", ".png", ".webp", ".bmp", ".tif", ".tiff", ".avif", *heif.SUFFIXES)
+IMAGES = (".jpg", ".jpeg", ".png", ".webp", ".bmp", ".tif", ".tiff", ".avif", *heif.SUFFIXES)
 MAX_TEXT_BYTES = 64 * 2**20
 
 
@@ -30,8 +29,18 @@ def natural_key(text: str) -> tuple[list[str | int], str]:
 
 
 def counted(number: int, one: str, many: str | None = None) -> str:
-    """`1 picture`, `2 pictures`."""
+    """`1 image`, `2 images`."""
     return f"{number} {one if number == 1 else many or one + 's'}"
+
+
+def some_of(names: Sequence[str], most: int = 3) -> str:
+    """The first few names, `, …` for the others."""
+    return ", ".join(names[:most]) + (", …" if len(names) > most else "")
+
+
+def words_of(name: str) -> set[str]:
+    """Words of a name, in lower case: of `imagesMask_2` images and mask."""
+    return set(re.findall(r"[a-z]+", re.sub(r"([a-z])([A-Z])", r"\1 \2", name).lower()))
 
 
 # --------------------------------------------------------------------------------------------------- folders
@@ -64,8 +73,8 @@ def is_file(path: Path) -> bool:
         return False
 
 
-def pictures_in(folder: Path, suffixes: Sequence[str] = PICTURES) -> list[Path]:
-    """Pictures directly in `folder`, in natural order; an absent folder holds none. Hidden files are left out."""
+def images_in(folder: Path, suffixes: Sequence[str] = IMAGES) -> list[Path]:
+    """Images directly in `folder`, in natural order; an absent folder holds none. Hidden files are left out."""
     if not folder.is_dir():
         return []
     found = [path for path in folder.iterdir() if path.suffix.lower() in suffixes and not path.name.startswith(".") and path.is_file()]
@@ -78,7 +87,7 @@ def files_in(folder: Path, pattern: str) -> list[Path]:
 
 
 def unique_names(paths: Sequence[Path]) -> list[str]:
-    """A short name for each picture: its stem; with its folders, then its suffix, where stems repeat."""
+    """A short name for each image: its stem; with its folders, then its suffix, where stems repeat."""
     stems = [path.stem for path in paths]
     if len(set(stems)) == len(stems):
         return stems
@@ -87,9 +96,7 @@ def unique_names(paths: Sequence[Path]) -> list[str]:
     while common < depth - 1 and len({path.parts[common] for path in paths}) == 1:
         common += 1
     short = ["_".join([*path.parts[common:-1], path.stem]) for path in paths]
-    if len(set(short)) == len(short):
-        return short
-    return ["_".join(path.parts[common:]) for path in paths]
+    return short if len(set(short)) == len(short) else ["_".join(path.parts[common:]) for path in paths]
 
 
 # --------------------------------------------------------------------------------------------------- small files
@@ -111,29 +118,17 @@ def read_text(path: Path, max_bytes: int = MAX_TEXT_BYTES) -> str:
         raise InputError(f"cannot read {path}: {error.strerror or error}") from error
 
 
-def number(word: str) -> float:
-    """A number as text, NaN also as Microsoft's C library writes it (`-1.#IND`, `nan(ind)`).
-
-    Raises:
-        ValueError: the text is no number.
-    """
-    return float("nan") if word.lower().lstrip("+-").startswith(("1.#", "nan")) else float(word)
-
-
 def read_numbers(path: Path) -> Array:
-    """All numbers of a text file, float64; values may be infinite or NaN.
-
-    Raises:
-        InputError: missing, not text, or a word that is not a number.
-    """
+    """All numbers of a text file, float64; values may be infinite or NaN, the latter also as Microsoft's C library has it (`-1.#IND`)."""
+    words = read_text(path).split()
     try:
-        return np.array([number(word) for word in read_text(path).split()], dtype=np.float64)
+        return np.array([float("nan") if word.lower().lstrip("+-").startswith(("1.#", "nan")) else float(word) for word in words])
     except ValueError as error:
         raise InputError(f"{path} must hold numbers only ({first_line(error)}); check how it was written") from error
 
 
 def read_matrix(path: Path, *shapes: tuple[int, int]) -> Array:
-    """A small matrix in one of `shapes`, told apart by how many numbers there are.
+    """A small matrix in one of `shapes`, distinguished by how many numbers there are.
 
     Raises:
         InputError: not such a matrix.
@@ -147,60 +142,54 @@ def read_matrix(path: Path, *shapes: tuple[int, int]) -> Array:
 
 
 def read_object(path: Path) -> dict[str, Any]:
-    """A JSON file whose top level is an object.
-
-    Raises:
-        InputError: missing, too large, not JSON, not an object.
-    """
-    try:
-        data = files.read_json(path)
-    except ValueError as error:  # whole numbers of thousands of digits
-        raise InputError(f"{path} is not valid JSON ({first_line(error)}); check how it was written") from error
+    """A JSON file whose top level is an object."""
+    data = files.read_json(path)
     if not isinstance(data, dict):
         raise InputError(f"{path} must hold a JSON object at its top level; check how it was written")
     return data
 
 
-# --------------------------------------------------------------------------------------------------- frames
+def number(data: Mapping[str, Any], key: str, where: str) -> float | None:
+    """`data[key]` as a finite float, None when absent."""
+    value = data.get(key)
+    if value is None:
+        return None
+    try:
+        if isinstance(value, bool) or not isinstance(value, int | float) or not np.isfinite(float(value)):
+            raise ValueError
+        return float(value)
+    except (ValueError, OverflowError) as error:
+        raise InputError(f"{where}: {key!r} must be a finite number, not {str(value)[:40]!r}; correct it") from error
 
 
-def posed_frame(name: str, image: Path, camera: Intrinsics, pose: Array, where: str, depth: Path | None = None) -> Frame:
-    """A frame with its pose (4, 4), and with depth by the same camera, whatever the sizes of the two.
-
-    Args:
-        where: what errors call the pose.
-
-    Raises:
-        InputError: the pose is not rigid, or the image or the depth map has another shape than the camera.
-    """
-    size = picture_header(image).size
-    intrinsics = fitted(camera, size, str(image))
-    by_header = depth is not None and depth.suffix.lower() not in (".pfm", ".exr")
-    depth_size = picture_header(depth).size if depth is not None and by_header else size
-    return Frame(
-        name=name,
-        image=image,
-        intrinsics=intrinsics,
-        world_from_camera=checked_pose(pose, where),
-        depth=depth,
-        depth_intrinsics=None if depth_size == size else fitted(intrinsics, depth_size, str(depth)),
-    )
+def numbers(value: Any, where: str, count: int | None = None, advice: str = "check how it was written") -> Array:
+    """Lists of numbers, or of words that are, as finite float64; `count` of them in all, if it is given."""
+    try:
+        array = np.array(value, dtype=np.float64)
+    except (ValueError, TypeError, OverflowError) as error:
+        raise InputError(f"{where} must hold numbers only; {advice}") from error
+    if array.ndim == 0 or count not in (None, array.size):
+        raise InputError(f"{where} must hold {'a list of numbers' if count is None else counted(count, 'number')}; {advice}")
+    if not np.isfinite(array).all():
+        raise InputError(f"{where} holds values that are not finite numbers; {advice}")
+    return array
 
 
 # --------------------------------------------------------------------------------------------------- at the end
 
 
-def same_count(pictures: int, poses: int, where: Path) -> None:
-    """Raises: InputError: the numbers of pictures and poses differ."""
-    if pictures != poses:
+def same_count(images: int, poses: int, where: Path) -> None:
+    """Raises: InputError: the numbers of images and poses differ."""
+    if images != poses:
         raise InputError(
-            f"{where} holds {counted(pictures, 'picture')} but {counted(poses, 'pose')}; "
-            "each picture needs exactly one pose, add or remove what does not belong"
+            f"{where} holds {counted(images, 'image')} but {counted(poses, 'pose')}; "
+            "each image needs exactly one pose, add or remove what does not belong"
         )
 
 
-def assemble(kind: str, root: Path, frames: list[Frame], remarks: Sequence[str] = (), **facts: Any) -> Capture:
-    """The capture, frames in natural order of their names. Unless `facts` say it, `alpha` is what a few of its pictures say.
+def assemble(kind: str, root: Path, frames: Sequence[Frame], remarks: Sequence[str] = (), **facts: Any) -> Capture:
+    """The capture, frames in natural order of their names; those without a name are named by their images. `alpha` is measured on a few
+    of its images unless `facts` have it.
 
     Raises:
         InputError: no frame is left, or two frames have one name.
@@ -208,11 +197,14 @@ def assemble(kind: str, root: Path, frames: list[Frame], remarks: Sequence[str] 
     if not frames and unread_frames():
         raise InputError(next(iter(unread_frames().values())))
     if not frames:
-        raise InputError(f"no usable picture was found in {root}; check the folder's layout")
+        raise InputError(f"no usable image was found in {root}; check the folder's layout")
+    if not all(frame.name for frame in frames):
+        names = unique_names([frame.image for frame in frames])
+        frames = [replace(frame, name=name) for frame, name in zip(frames, names, strict=True)]
     names = [frame.name for frame in frames]
     if len(set(names)) != len(names):
         twice = next(name for name in names if names.count(name) > 1)
-        raise InputError(f"{root}: the picture {twice!r} is listed twice; list each picture once")
+        raise InputError(f"{root}: the image {twice!r} is listed twice; list each image once")
     if "alpha" not in facts:
         facts["alpha"] = cut_out(frames)
     ordered = sorted(frames, key=lambda frame: natural_key(frame.name))

@@ -1,8 +1,8 @@
-"""Masks that lie beside a capture's images, found by their names. White is used, black is left out: of fits, scores, features and depth.
+"""Masks that lie beside a capture's images, found by their names. White is used, black is excluded: from fits, scores, features and depth.
 
 Read are folders named as masks are (`masks/`, `images_mask/`, `silhouettes/`, …), beside the images' folder or above it, with files
 named after the images (`NAME.png`, COLMAP's `NAME.jpg.png`, `NAME_mask.png`, …) or numbered as they are; and masks among the images
-(`NAME_mask.png`, `NAME.alpha.png`). instant-ngp's `dynamic_mask_NAME.png` are the other way round: white is left out.
+(`NAME_mask.png`, `NAME.alpha.png`). instant-ngp's `dynamic_mask_NAME.png` are the other way round: white is excluded.
 """
 
 from __future__ import annotations
@@ -18,9 +18,9 @@ import cv2
 import numpy as np
 
 from fieldfuse.capture import heif
-from fieldfuse.capture.images import LOSSY, decode, load_image, load_mask, turns_by_exif, usable_pixels
-from fieldfuse.capture.listing import counted, natural_key, pictures_in
-from fieldfuse.capture.sizes import picture_header
+from fieldfuse.capture.headers import image_header
+from fieldfuse.capture.images import LOSSY, decode, load_image, load_mask, spread, turns_by_exif, usable_pixels
+from fieldfuse.capture.listing import counted, images_in, natural_key, words_of
 from fieldfuse.capture.types import Capture, Frame
 from fieldfuse.errors import InputError
 
@@ -29,8 +29,9 @@ FILE_WORDS = {*FOLDER_WORDS, "alpha", "removebg", "nobg", "cutout"}
 PHOTOS = (".jpg", ".jpeg", *heif.SUFFIXES)  # a mask is none of these where it has its image's name
 SHARED = re.compile(r"(camera[_-]?)?mask")  # the name of one mask for all images
 OTHER_WORDS = {"depth", "depths", "normal", "normals", "confidence", "overlay", "overlays"}  # `depth_masks/` is of something else
-OTHER_WAY_ROUND = "dynamic"  # what such a mask marks is left out
+INVERTED = "dynamic"  # what such a mask marks is excluded
 SAMPLED = 16  # images whose names are compared with all masks' to find how these are called
+LOOKED_AT = 5  # masks, and images, whose pixels are looked at
 PIXELS = 150e6  # of masks that are decoded at once; of more, evenly spread ones
 SHAPE = 0.02  # how far a mask's ratio of width to height may be from its image's
 LITTLE = 0.1  # of the pixels; masks that leave less, all of them, may mark the wrong side
@@ -43,7 +44,7 @@ INSTEAD = "if white marks what is to be left out, give --set capture.masks=inver
 class _Found:
     masks: dict[int, Path]  # index of a frame → its mask
     place: str  # as it is named to people
-    excludes: bool
+    excludes: bool = False
 
 
 def with_masks(capture: Capture, use: str = "auto") -> Capture:
@@ -53,13 +54,10 @@ def with_masks(capture: Capture, use: str = "auto") -> Capture:
     which nothing is left are dropped themselves.
 
     Args:
-        use: auto | inverted (white is left out) | off.
-
-    Raises:
-        InputError: the masks leave nothing of any image.
+        use: auto | inverted (white is excluded) | off.
     """
     if use == "off":
-        return replace(capture, frames=tuple(replace(frame, mask=None, mask_excludes=False) for frame in capture.frames))
+        return capture.with_frames(map(_unmasked, capture.frames))
     if capture.filmed:
         return capture
     remarks: list[str] = []
@@ -79,28 +77,25 @@ def with_masks(capture: Capture, use: str = "auto") -> Capture:
     exif = turns_by_exif(capture)
     frames = _without_bad(frames, exif, remarks)
     masked = [index for index, frame in enumerate(frames) if frame.mask is not None]
-    if not masked:
-        return capture.with_frames(frames, *remarks)
-    shares, unreadable = _shares([frames[index] for index in masked])
-    for at in unreadable:
-        frames[masked[at]] = replace(frames[masked[at]], mask=None)
+    shares, unreadable = _shares(frames, masked)
+    for index in unreadable:
+        frames[index] = replace(frames[index], mask=None)
     if unreadable:
-        first = capture.frames[masked[unreadable[0]]].name
+        first = capture.frames[unreadable[0]].name
         remarks.append(f"{counted(len(unreadable), 'mask')} cannot be read (of {first}{', …' if len(unreadable) > 1 else ''}) and not used")
     if not shares:
         return capture.with_frames(frames, *remarks)
     if len(shares) + len(unreadable) == len(masked) and min(shares.values()) > WHOLE:
-        return capture.with_frames([replace(frame, mask=None, mask_excludes=False) for frame in frames], *remarks)
+        return capture.with_frames(map(_unmasked, frames), *remarks)
     if max(shares.values()) < NOTHING and len(masked) == len(frames):
         raise InputError(f"the masks{place} of {capture.root} leave nothing of any image (black is left out); {INSTEAD}")
-    if len(masked) == len(frames) and not unreadable and (colour := _cut_out_on([frames[at] for at in shares], exif)):
+    if len(masked) == len(frames) and not unreadable and (colour := _cut_out_on([frames[index] for index in shares], exif)):
         frames = [replace(frame, mask_is_alpha=True) for frame in frames]
         remarks.append(f"the images are cut out on {colour} already, so {counted(len(frames), 'mask')}{place} are taken as their alpha")
         return replace(capture.with_frames(frames, *remarks), alpha=True)
     excluding = frames[masked[0]].mask_excludes
-    empty = {masked[at] for at, share in shares.items() if share == 0}
-    frames = [frame for index, frame in enumerate(frames) if index not in empty]
-    count = sum(frame.mask is not None for frame in frames)
+    frames = [frame for index, frame in enumerate(frames) if shares.get(index) != 0]
+    count, empty = sum(frame.mask is not None for frame in frames), len(capture.frames) - len(frames)
     if count:
         share = float(np.mean([share for share in shares.values() if share > 0]))
         remarks.append(
@@ -109,38 +104,42 @@ def with_masks(capture: Capture, use: str = "auto") -> Capture:
             + ("" if count == len(frames) else "; images without one are used whole")
         )
     if empty:
-        remarks.append(f"{counted(len(empty), 'image')} of which the masks leave nothing {'is' if len(empty) == 1 else 'are'} not used")
+        remarks.append(f"{counted(empty, 'image')} of which the masks leave nothing {'is' if empty == 1 else 'are'} not used")
     if count and max(shares.values()) < LITTLE:
         remarks.append(f"the masks leave less than {100 * LITTLE:.0f}% of every image; {INSTEAD}")
     return capture.with_frames(frames, *remarks)
 
 
-def masks_among(pictures: Sequence[Path]) -> set[Path]:
-    """Those of a folder's pictures that are masks of others, by their names (`NAME_mask.png`) and by what a few of them show."""
+def masks_among(images: Sequence[Path]) -> set[Path]:
+    """Those of a folder's images that are masks of others, by their names (`NAME_mask.png`) and by what a few of them show."""
     out: set[Path] = set()
-    named, twins = _named(pictures), _twins(pictures)
-    images = [path for path in pictures if path not in {*named, *twins}]
+    named, twins = _named(images), _twins(images)
+    others = [path for path in images if path not in {*named, *twins}]
     shared = [path for path in named if SHARED.fullmatch(path.stem.lower())]
-    for found in (*(sorted(_match(images, some, among=True).values()) for some in (named, twins)), shared if len(shared) == 1 else []):
-        if len(images) > 1 and found and _show_masks(found):
+    for found in (*(sorted(_match(others, some, among=True).values()) for some in (named, twins)), shared if len(shared) == 1 else []):
+        if len(others) > 1 and found and _show_masks(found):
             out |= set(found)
     return out
 
 
-def _named(pictures: Sequence[Path]) -> list[Path]:
-    return [path for path in pictures if _words(path.stem) & FILE_WORDS]
-
-
-def _twins(pictures: Sequence[Path]) -> list[Path]:
-    """Of `NAME.jpg` and `NAME.png` the latter, which may be the mask of the former."""
-    photos = {path.stem.lower() for path in pictures if path.suffix.lower() in PHOTOS}
-    return [path for path in pictures if path.suffix.lower() not in PHOTOS and path.stem.lower() in photos]
-
-
 def is_mask_folder(name: str) -> bool:
     """Whether a folder of that name holds masks."""
-    words = _words(name)
+    words = words_of(name)
     return bool(words & FOLDER_WORDS) and not words & OTHER_WORDS
+
+
+def _unmasked(frame: Frame) -> Frame:
+    return replace(frame, mask=None, mask_excludes=False)
+
+
+def _named(images: Sequence[Path]) -> list[Path]:
+    return [path for path in images if words_of(path.stem) & FILE_WORDS]
+
+
+def _twins(images: Sequence[Path]) -> list[Path]:
+    """Of `NAME.jpg` and `NAME.png` the latter, which may be the mask of the former."""
+    photos = {path.stem.lower() for path in images if path.suffix.lower() in PHOTOS}
+    return [path for path in images if path.suffix.lower() not in PHOTOS and path.stem.lower() in photos]
 
 
 # ------------------------------------------------------------------------------------------------ found by names
@@ -148,11 +147,12 @@ def is_mask_folder(name: str) -> bool:
 
 def _find(capture: Capture, remarks: list[str]) -> _Found | None:
     """The masks of the place that has most of them; remarks on masks that are not used."""
+    root = capture.root.resolve()
     places: dict[Path, dict[int, Path]] = {}
     among: set[Path] = set()  # folders of images that hold masks, too
     for place, directory, indices in _places(capture):
         images = [capture.frames[index].image for index in indices]
-        beside = pictures_in(directory)
+        beside = images_in(directory)
         if place == directory == images[0].resolve().parent:
             used = {image.name for image in images}
             beside = [path for path in (*_named(beside), *_twins(beside)) if path.name not in used]
@@ -160,24 +160,27 @@ def _find(capture: Capture, remarks: list[str]) -> _Found | None:
         found = _match(images, beside, among=place in among)
         if place not in among and not found and len(beside) == 1:
             found = dict.fromkeys(range(len(images)), beside[0])
-        for at, path in found.items():
-            if path.resolve().is_relative_to(capture.root.resolve()):
-                places.setdefault(place, {})[indices[at]] = path.resolve()
-        places.setdefault(place, {})
-    names = {place: _name(capture.root, place) for place in places}
-    usual = _factor(Counter(frame.image.parent.name for frame in capture.frames).most_common(1)[0][0])
-    ranked = sorted(places, key=lambda place: (-len(places[place]), _factor(names[place]) != usual, len(names[place])))
+        places.setdefault(place, {}).update(
+            {indices[at]: path.resolve() for at, path in found.items() if path.resolve().is_relative_to(root)}
+        )
+    names = {place: "the folder of the images" if place == root else f"{place.relative_to(root).as_posix()}/" for place in places}
+
+    def factor(name: str) -> str:  # of `images_4` 4
+        match = re.search(r"_([0-9]+)/?$", name)
+        return match[1] if match else ""
+
+    usual = factor(Counter(frame.image.parent.name for frame in capture.frames).most_common(1)[0][0])
     best = None
-    for place in ranked:
-        masks = places[place]
+    for place in sorted(places, key=lambda place: (-len(places[place]), factor(names[place]) != usual, len(names[place]))):
+        masks, name = places[place], names[place]
         if masks and best is None and not _show_masks([masks[index] for index in sorted(masks)]):
-            remarks.append(f"what lies in {names[place]} is not used: it is neither black and white nor has it alpha, as masks do")
+            remarks.append(f"what lies in {name} is not used: it is neither black and white nor has it alpha, as masks do")
         elif masks and best is None:
-            marks = [path.stem if place in among else f"{names[place]} {path.stem}" for path in masks.values()]
-            best = _Found(masks, f"{names[place]}", sum(OTHER_WAY_ROUND in _words(mark) for mark in marks) > len(marks) / 2)
+            marks = [path.stem if place in among else f"{name} {path.stem}" for path in masks.values()]
+            best = _Found(masks, name, sum(INVERTED in words_of(mark) for mark in marks) > len(marks) / 2)
         elif place not in among or masks:
             why = "other masks are" if masks else "their names fit no image"
-            remarks.append(f"the masks in {names[place]} are not used: {why}")
+            remarks.append(f"the masks in {name} are not used: {why}")
     return best or _shared(capture)
 
 
@@ -185,11 +188,11 @@ def _shared(capture: Capture) -> _Found | None:
     """One mask for all images: `mask.png` among them or above."""
     root = capture.root.resolve()
     for folder in sorted({root, *(frame.image.resolve().parent for frame in capture.frames)}):
-        masks = [path for path in pictures_in(folder) if SHARED.fullmatch(path.stem.lower())] if folder.is_relative_to(root) else []
+        masks = [path for path in images_in(folder) if SHARED.fullmatch(path.stem.lower())] if folder.is_relative_to(root) else []
         if len(masks) == 1 and len(capture.frames) > 1 and _show_masks(masks):
             mask = masks[0].resolve()
             if all(frame.image.resolve() != mask for frame in capture.frames):
-                return _Found(dict.fromkeys(range(len(capture.frames)), mask), mask.relative_to(root).as_posix(), False)
+                return _Found(dict.fromkeys(range(len(capture.frames)), mask), mask.relative_to(root).as_posix())
     return None
 
 
@@ -207,16 +210,14 @@ def _places(capture: Capture) -> Iterator[tuple[Path, Path, list[int]]]:
         above = [folder, *(parent for parent in folder.parents if parent.is_relative_to(root))]
         for base in above:
             if base not in children:
-                children[base] = sorted(
-                    (child for child in base.iterdir() if child.is_dir() and is_mask_folder(child.name) and not child.name.startswith(".")),
-                    key=lambda child: natural_key(child.name),
-                )
+                named = [child for child in base.iterdir() if is_mask_folder(child.name) and not child.name.startswith(".")]
+                children[base] = sorted(filter(Path.is_dir, named), key=lambda child: natural_key(child.name))
             for place in children[base]:
                 if place in above:
                     continue
                 parts = folder.relative_to(base).parts
                 folders = [place.joinpath(*rest) for rest in dict.fromkeys((parts, parts[1:]))]
-                inside = [directory for directory in folders if directory.resolve().is_relative_to(root) and pictures_in(directory)]
+                inside = [directory for directory in folders if directory.resolve().is_relative_to(root) and images_in(directory)]
                 if inside or (place.resolve().is_relative_to(root) and any(place.iterdir())):
                     yield place, (inside or [place])[0], indices
 
@@ -225,14 +226,13 @@ def _match(images: Sequence[Path], masks: Sequence[Path], *, among: bool) -> dic
     """Index of an image → its mask: by what all masks' names add to their images', else (not `among` the images) by the last number."""
     by_name = {path.stem.lower(): path for path in reversed(masks)}
     votes: Counter[tuple[str, str]] = Counter()
-    for at in np.unique(np.linspace(0, len(images) - 1, SAMPLED).round()) if images else ():
-        image = images[int(at)]
+    for image in spread(images, SAMPLED):
         stem, suffix = image.stem.lower(), image.suffix.lower()
         for name in by_name:
             start = name.find(stem)
             if start >= 0 and _apart(name[:start], stem[0]) and _apart(name[start + len(stem) :][::-1], stem[-1]):
                 before, after = name[:start], name[start + len(stem) :]
-                if after.startswith(suffix) or not among or not before + after or _words(before + " " + after) & FILE_WORDS:
+                if after.startswith(suffix) or not among or not before + after or words_of(before + " " + after) & FILE_WORDS:
                     votes[before, after.replace(suffix, "{}", 1) if after.startswith(suffix) else after] += 1
     out: dict[int, Path] = {}
     for before, after in sorted(votes, key=lambda affix: (-votes[affix], len(affix[0] + affix[1]), affix)):
@@ -242,11 +242,11 @@ def _match(images: Sequence[Path], masks: Sequence[Path], *, among: bool) -> dic
                 out[at] = by_name[name]
     if out or among:
         return out
-    numbers = Counter(_number(image) for image in images), Counter(_number(path) for path in masks)
-    by_number = {_number(path): path for path in masks}
-    if any(counts.get(None) or max(counts.values(), default=2) > 1 for counts in numbers):
+    numbers = [[int(found[-1]) if (found := re.findall(r"[0-9]{1,18}", path.stem)) else None for path in some] for some in (images, masks)]
+    if any(None in some or len(set(some)) < len(some) or not some for some in numbers):
         return {}
-    out = {at: by_number[number] for at, image in enumerate(images) if (number := _number(image)) in by_number}
+    by_number = dict(zip(numbers[1], masks, strict=True))
+    out = {at: by_number[number] for at, number in enumerate(numbers[0]) if number in by_number}
     return out if 2 * len(out) >= len(images) else {}
 
 
@@ -255,45 +255,24 @@ def _apart(beside: str, end: str) -> bool:
     return not beside or not ((beside[-1].isdigit() and end.isdigit()) or (beside[-1].isalpha() and end.isalpha()))
 
 
-def _number(path: Path) -> int | None:
-    found = re.findall(r"[0-9]{1,18}", path.stem)
-    return int(found[-1]) if found else None
-
-
-def _words(name: str) -> set[str]:
-    """Words of a name, in lower case: of `imagesMask_2` images and mask."""
-    return set(re.findall(r"[a-z]+", re.sub(r"([a-z])([A-Z])", r"\1 \2", name).lower()))
-
-
-def _factor(name: str) -> str:
-    """By how much images of a folder were made smaller: of `images_4` 4."""
-    match = re.search(r"_([0-9]+)/?$", name)
-    return match[1] if match else ""
-
-
-def _name(root: Path, place: Path) -> str:
-    name = place.relative_to(root.resolve()).as_posix()
-    return "the folder of the images" if name == "." else f"{name}/"
-
-
 # ------------------------------------------------------------------------------------------------ looked at
 
 
 def _show_masks(paths: Sequence[Path]) -> bool:
     """Whether most of a few files are masks by what they show: alpha, black and white, or few flat colours. What cannot be read counts."""
-    chosen = [paths[int(at)] for at in np.unique(np.linspace(0, len(paths) - 1, 5).round())] if paths else []
+    chosen = spread(paths, LOOKED_AT)
     return sum(map(_shows_mask, chosen)) * 2 > len(chosen)
 
 
 def _shows_mask(path: Path) -> bool:
     try:
-        picture, header = decode(path)
+        image, header = decode(path)
     except InputError:
         return True
-    if picture.ndim == 3 and picture.shape[2] in (2, 4) and picture[:, :, -1].min() < picture[:, :, -1].max():
+    if image.ndim == 3 and image.shape[2] in (2, 4) and image[:, :, -1].min() < image[:, :, -1].max():
         return True
-    step = max(1, int(max(picture.shape[:2]) / 256))
-    few = picture[::step, ::step].reshape(-1, 1 if picture.ndim == 2 else picture.shape[2])[:, :3].astype(np.float64)
+    step = max(1, int(max(image.shape[:2]) / 256))
+    few = image[::step, ::step].reshape(-1, 1 if image.ndim == 2 else image.shape[2])[:, :3].astype(np.float64)
     low, high = few.min(axis=1), few.max(axis=1)
     top = max(float(few.max()), 1.0)
     flat = ((high < 0.12 * top) | (low > 0.88 * top)).mean() > 0.9
@@ -302,19 +281,18 @@ def _shows_mask(path: Path) -> bool:
 
 def _cut_out_on(frames: Sequence[Frame], exif: bool) -> str:
     """`white` or `black` where a few images show nothing else outside their masks, and enough of it; else empty."""
-    chosen = [frames[int(at)] for at in np.unique(np.linspace(0, len(frames) - 1, 5).round())]
     plain = {"white": True, "black": True}
-    for frame in chosen:
+    for frame in spread(frames, LOOKED_AT):
         try:
-            picture = load_image(frame, exif=exif)
+            image = load_image(frame, exif=exif)
         except InputError:
             return ""
-        usable = usable_pixels(frame, picture[:, :, :3], exif=exif)
+        usable = usable_pixels(frame, image[:, :, :3], exif=exif)
         if usable is None or usable.mean() > 1 - LITTLE:
             return ""
         # Masks of another size, or drawn by hand, are off by a pixel or two at the edge.
-        reach = 2 * math.ceil(max(picture.shape) / 200) + 1
-        outside = picture[cv2.dilate(usable.astype(np.uint8), np.ones((reach, reach), np.uint8)) == 0][:, :3]
+        reach = 2 * math.ceil(max(image.shape) / 200) + 1
+        outside = image[cv2.dilate(usable.astype(np.uint8), np.ones((reach, reach), np.uint8)) == 0][:, :3]
         plain["white"] &= len(outside) > 0 and bool((outside.min(axis=1) >= 240).mean() > PLAIN)
         plain["black"] &= len(outside) > 0 and bool((outside.max(axis=1) <= 15).mean() > PLAIN)
     return next((colour for colour, is_so in plain.items() if is_so), "")
@@ -322,41 +300,40 @@ def _cut_out_on(frames: Sequence[Frame], exif: bool) -> str:
 
 def _without_bad(frames: list[Frame], exif: bool, remarks: list[str]) -> list[Frame]:
     """Without masks of another shape than their image (turned ones fit, where images are turned), or that are no images."""
-    out, shapes, broken = [], [], []
+    out: list[Frame] = []
+    bad: dict[str, list[str]] = {"of another shape than their image": [], "no images that can be read": []}
+    shape, broken = bad.values()
     for frame in frames:
         if frame.mask is not None:
             try:
-                width, height = picture_header(frame.mask).size
-                wide, high = picture_header(frame.image).size
-                if not (width and wide):
-                    raise InputError(f"{frame.mask} or its image cannot be read")
-            except InputError:
-                broken.append(frame.name)
-                frame = replace(frame, mask=None, mask_excludes=False)
-            else:
-                fits = [abs(width * high / (height * wide) - 1) < SHAPE, exif and abs(width * wide / (height * high) - 1) < SHAPE]
-                if not any(fits):
-                    shapes.append(frame.name)
-                    frame = replace(frame, mask=None, mask_excludes=False)
+                (width, height), (wide, high) = image_header(frame.mask).size, image_header(frame.image).size
+                ratios = [(width * high / (height * wide)), *([width * wide / (height * high)] if exif else [])]
+                wrong = None if any(abs(ratio - 1) < SHAPE for ratio in ratios) else shape
+            except (InputError, ZeroDivisionError):
+                wrong = broken
+            if wrong is not None:
+                wrong.append(frame.name)
+                frame = _unmasked(frame)
         out.append(frame)
-    for names, why in ((shapes, "of another shape than their image"), (broken, "no images that can be read")):
+    for why, names in bad.items():
         if names:
             verb = "mask is" if len(names) == 1 else "masks are"
             remarks.append(f"{len(names)} {verb} {why} (of {names[0]}{', …' if len(names) > 1 else ''}) and not used")
     return out
 
 
-def _shares(frames: Sequence[Frame]) -> tuple[dict[int, float], list[int]]:
+def _shares(frames: Sequence[Frame], masked: Sequence[int]) -> tuple[dict[int, float], list[int]]:
     """Share of pixels that masks leave, by the index of the frame, of as many as `PIXELS` allows; and the indices of those unreadable."""
-    sizes = [picture_header(frame.mask).size for frame in frames if frame.mask is not None]
+    shares: dict[int, float] = {}
+    unreadable: list[int] = []
+    if not masked:
+        return shares, unreadable
+    sizes = [image_header(mask).size for index in masked if (mask := frames[index].mask) is not None]
     most = max(8, int(PIXELS / max(1.0, float(np.mean([width * height for width, height in sizes])))))
-    shares, unreadable = {}, []
-    for at in np.unique(np.linspace(0, len(frames) - 1, min(most, len(frames))).round().astype(int)):
+    for index in spread(masked, min(most, len(masked))):
         try:
-            mask = load_mask(frames[at])
+            mask = load_mask(frames[index])
+            shares[index] = 1.0 if mask is None else float(mask.mean())
         except (InputError, cv2.error):
-            unreadable.append(int(at))
-        else:
-            assert mask is not None
-            shares[int(at)] = float(mask.mean())
+            unreadable.append(index)
     return shares, unreadable

@@ -1,7 +1,7 @@
-"""A folder of photos. Poses are unknown; a focal length in pixels comes from EXIF where a photo has one.
+"""A folder of photos, whose poses are unknown; a focal length in pixels comes from EXIF where a photo has one. And what else lies there.
 
-EXIF orientation: `images.load_image` turns pictures upright for this kind only, never for captures that bring poses (their
-intrinsics are for the stored pixels). The focal length in pixels is the same either way, so nothing about it is carried here.
+EXIF orientation: `images.load_image` turns images upright for this kind only, not for captures with poses (their intrinsics are
+for the stored pixels). The focal length in pixels is the same either way.
 """
 
 from __future__ import annotations
@@ -10,6 +10,7 @@ import math
 import os
 import re
 import warnings
+from collections import Counter
 from contextlib import suppress
 from dataclasses import replace
 from pathlib import Path
@@ -17,11 +18,13 @@ from typing import Any
 
 from PIL import Image
 
+from fieldfuse.capture.colmap import holds_model
+from fieldfuse.capture.headers import image_header
 from fieldfuse.capture.heif import SUFFIXES as HEIF_SUFFIXES
-from fieldfuse.capture.listing import assemble, counted, natural_key, pictures_in, require_folder, unique_names
+from fieldfuse.capture.listing import IMAGES, assemble, counted, images_in, natural_key, require_folder, some_of, words_of
 from fieldfuse.capture.masks import is_mask_folder, masks_among
-from fieldfuse.capture.sizes import picture_header
 from fieldfuse.capture.types import Capture, Frame
+from fieldfuse.capture.video import VIDEO_SUFFIXES
 from fieldfuse.errors import InputError
 from fieldfuse.files import require_utf8
 
@@ -33,6 +36,19 @@ NO_PHOTOS = {
     *("thumb", "thumbs", "thumbnail", "thumbnails", "preview", "previews", "render", "renders", "results", "output", "outputs"),
 }
 SMALLER = re.compile(r".*_(2|4|8|16|32)")  # the same photos made smaller, as in images_4
+POSE_FILES = re.compile(
+    r"transforms.*\.json|cameras.*\.(npz|json|xml)|poses_bounds.*\.npy|.*\.(nvm|out|abc|psz)|traj(ectory)?\.(txt|log)|groundtruth\.txt",
+    re.IGNORECASE,
+)
+# Kinds whose readers take none of these lists of poses but their own; the others may take any.
+OWN_POSES = {
+    **dict.fromkeys(("photos", "video", "colmap"), "$"),
+    "transforms": r"transforms.*\.json",
+    "blender": r"transforms_.*\.json",
+    "llff": r"poses_bounds\.npy",
+    "dtu": r"cameras.*\.npz",
+}
+UNPOSED = "beside these are not in the model and are left out"  # how the remark on them ends
 FILM_DIAGONAL = math.hypot(36.0, 24.0)  # mm
 EXIF_FOLDER = 0x8769
 FOCAL_LENGTH, FOCAL_LENGTH_35 = 0x920A, 0xA405
@@ -41,17 +57,22 @@ PLANE_UNIT_MM = {2: 25.4, 3: 10.0, 4: 1.0, 5: 1e-3}
 
 
 def looks_like_photos(path: Path) -> bool:
-    return any(pictures_in(path / folder) for folder in FOLDERS) or bool(photo_folders(path))
+    return any(images_in(path / folder) for folder in FOLDERS) or bool(photo_folders(path))
 
 
 def photo_files(root: Path) -> list[Path]:
-    """The pictures of whichever of `FOLDERS` holds most."""
-    return max((pictures_in(root / folder) for folder in FOLDERS), key=len)
+    """The images of whichever of `FOLDERS` holds most."""
+    return max((images_in(root / folder) for folder in FOLDERS), key=len)
 
 
 def photo_folders(root: Path) -> dict[Path, list[Path]]:
     """Folders at and below `root` that hold photos, and these: without masks, and without what is no photo (depth, small copies) or a
     capture of its own. At most `DEEP` folders down; links are not followed."""
+
+    def may_hold_photos(name: str) -> bool:
+        other = words_of(name.lower()) & NO_PHOTOS or is_mask_folder(name) or SMALLER.fullmatch(name.lower())
+        return not (name.startswith((".", "__")) or other)
+
     out: dict[Path, list[Path]] = {}
     looked = 0
     for place, children, names in os.walk(root):
@@ -60,14 +81,14 @@ def photo_folders(root: Path) -> dict[Path, list[Path]]:
         looked += 1 + len(names)
         if looked > MOST_FILES:
             break
-        if below and (any(OWN_CAPTURE.fullmatch(name) for name in [*names, *children])):
+        if below and any(OWN_CAPTURE.fullmatch(name) for name in [*names, *children]):
             children.clear()
             continue
-        children[:] = [] if len(below) >= DEEP else sorted((name for name in children if _may_hold_photos(name)), key=natural_key)
-        pictures = pictures_in(folder)
-        masks = masks_among(pictures)
-        if len(masks) < len(pictures):
-            out[folder] = [picture for picture in pictures if picture not in masks]
+        children[:] = [] if len(below) >= DEEP else sorted(filter(may_hold_photos, children), key=natural_key)
+        images = images_in(folder)
+        masks = masks_among(images)
+        if len(masks) < len(images):
+            out[folder] = [image for image in images if image not in masks]
     return out
 
 
@@ -75,21 +96,20 @@ def read_photos(path: Path | str) -> Capture:
     """Photos in the folder and in folders below it that look like the same capture: of one size, or in folders that are numbered (`cam1/`).
 
     Raises:
-        InputError: missing or empty folder, no photo, a file that is not a picture, or folders of different captures.
+        InputError: missing or empty folder, no photo, a file that is not an image, or folders of different captures.
     """
     root = require_folder(path)
-    pictures, remarks = _of_one_capture(root, photo_folders(root))
-    if not pictures:
+    images, remarks = _of_one_capture(root, photo_folders(root))
+    if not images:
         raise InputError(f"no photo (jpg, heic, png, webp, bmp, tif) was found in {root}; give the folder that holds them")
-    for picture in pictures:
-        require_utf8(picture)
-    pictures, double = _once_each(pictures)
-    remarks += double
-    frames = [
-        Frame(name=name, image=picture, focal_prior=focal_from_exif(picture))
-        for name, picture in zip(unique_names(pictures), pictures, strict=True)
-    ]
-    return assemble("photos", root, frames, remarks)
+    for image in images:
+        require_utf8(image)
+    # Phones and programs leave a .heic beside what they convert it to: a photo twice would be fitted and held out at once.
+    others = {image.stem for image in images if image.suffix.lower() not in HEIF_SUFFIXES}
+    once = [image for image in images if image.suffix.lower() not in HEIF_SUFFIXES or image.stem not in others]
+    if double := len(images) - len(once):
+        remarks.append(f"{counted(double, 'image is', 'images are')} there as HEIC and in another format; the latter is used")
+    return assemble("photos", root, [Frame(name="", image=image, focal_prior=focal_from_exif(image)) for image in once], remarks)
 
 
 def with_unposed(capture: Capture) -> Capture:
@@ -97,18 +117,14 @@ def with_unposed(capture: Capture) -> Capture:
     if not capture.extra.get("unregistered"):
         return capture
     own = {frame.image for frame in capture.frames}
-    beside = [path for folder in sorted({path.parent for path in own}) for path in pictures_in(folder) if path not in own]
-    images = [*(frame.image for frame in capture.frames), *beside]
-    frames = [*capture.frames, *(Frame(name="", image=path, focal_prior=focal_from_exif(path)) for path in beside)]
-    named = [replace(frame, name=name) for frame, name in zip(frames, unique_names(images), strict=True)]
-    remarks = [text for text in capture.warnings if not text.endswith("are not in the model and are left out")]
-    whole = assemble(capture.kind, capture.root, named, remarks, alpha=capture.alpha)
+    beside = [path for folder in sorted({path.parent for path in own}) for path in images_in(folder) if path not in own]
+    frames = [
+        *(replace(frame, name="") for frame in capture.frames),
+        *(Frame(name="", image=path, focal_prior=focal_from_exif(path)) for path in beside),
+    ]
+    remarks = [text for text in capture.warnings if not text.endswith(UNPOSED)]
+    whole = assemble(capture.kind, capture.root, frames, remarks, alpha=capture.alpha)
     return replace(capture, frames=whole.frames, warnings=whole.warnings, extra={**capture.extra, "unregistered": 0})
-
-
-def _may_hold_photos(name: str) -> bool:
-    words = set(re.findall(r"[a-z]+", name.lower()))
-    return not (name.startswith((".", "__")) or words & NO_PHOTOS or is_mask_folder(name) or SMALLER.fullmatch(name.lower()))
 
 
 def _of_one_capture(root: Path, folders: dict[Path, list[Path]]) -> tuple[list[Path], list[str]]:
@@ -117,101 +133,81 @@ def _of_one_capture(root: Path, folders: dict[Path, list[Path]]) -> tuple[list[P
     main = max(usual or list(folders), key=lambda folder: len(folders[folder]), default=None)
     if main is None:
         return [], []
-    taken: list[Path] = [main]
-    others: list[Path] = []
-    sizes = _sizes(folders[main])
-    for folder, pictures in folders.items():
-        if folder != main:
-            alike = len(pictures) > 1 and (bool(sizes & _sizes(pictures)) or _numbered(folder.name) == _numbered(main.name) != "")
-            (taken if alike else others).append(folder)
+
+    def stem(name: str) -> str:  # `cam` of `cam1` and `cam_2`; empty for a name without a number
+        match = re.fullmatch(r"([a-z]+)[ _-]*[0-9]+", name.lower())
+        return match[1] if match else ""
 
     def listed(some: list[Path]) -> str:
         names = [f"{folder.relative_to(root).as_posix()}/ ({len(folders[folder])})" for folder in some]
-        return ", ".join(names[:4]).replace("./ ", "the folder itself ") + (", …" if len(names) > 4 else "")
+        return some_of(names, 4).replace("./ ", "the folder itself ")
 
+    sizes, used, others = _sizes(folders[main]), [main], []
+    for folder, images in folders.items():
+        if folder != main:
+            alike = len(images) > 1 and (bool(sizes & _sizes(images)) or stem(folder.name) == stem(main.name) != "")
+            (used if alike else others).append(folder)
     if others and not usual and any(len(folders[folder]) > 1 for folder in others):
-        raise InputError(
-            f"{root} holds photos of different sizes in {listed([*taken, *others])}, which look like several captures; "
-            "give one of the folders"
-        )
+        places = listed([*used, *others])
+        raise InputError(f"{root} holds photos of different sizes in {places}, which look like several captures; give one of the folders")
     remarks = []
-    if len(taken) > 1:
-        remarks.append(f"the photos of {len(taken)} folders are taken as one capture: {listed(taken)}; give one folder to use it alone")
+    if len(used) > 1:
+        remarks.append(f"the photos of {len(used)} folders are taken as one capture: {listed(used)}; give one folder to use it alone")
     if others:
         remarks.append(f"the photos in {listed(others)} look like others and are not used")
-    order = [folder for folder in folders if folder in taken]
-    return [picture for folder in order for picture in folders[folder]], remarks
+    return [image for folder in folders if folder in used for image in folders[folder]], remarks
 
 
-def _sizes(pictures: list[Path]) -> set[tuple[int, int]]:
-    """Long and short side of a few of the pictures; files that cannot be read are passed over."""
+def _sizes(images: list[Path]) -> set[tuple[int, int]]:
+    """Long and short side of a few of the images; files that cannot be read are passed over."""
     out = set()
-    for picture in pictures[:: max(1, len(pictures) // 5)]:
+    for image in images[:: max(1, len(images) // 5)]:
         with suppress(InputError):
-            width, height = picture_header(picture).size
+            width, height = image_header(image).size
             out.add((max(width, height), min(width, height)))
     return out
 
 
-def _numbered(name: str) -> str:
-    """What folders of one kind share: `cam` of `cam1` and `cam_2`; empty for a name without a number."""
-    match = re.fullmatch(r"([a-z]+)[ _-]*[0-9]+", name.lower())
-    return match[1] if match else ""
-
-def _once_each(pictures: list[Path]) -> tuple[list[Path], list[str]]:
-    """The pictures without those `.heic` that lie beside another picture of their name, as phones and programs leave them that convert
-    them: a photo that is there twice would be fitted and held out at once."""
-    others = {picture.stem for picture in pictures if picture.suffix.lower() not in HEIF_SUFFIXES}
-    kept = [picture for picture in pictures if picture.suffix.lower() not in HEIF_SUFFIXES or picture.stem not in others]
-    double = len(pictures) - len(kept)
-    if not double:
-        return kept, []
-    return kept, [f"{counted(double, 'picture is', 'pictures are')} there as HEIC and in another format; the latter is used"]
+# ------------------------------------------------------------------------------------------------ EXIF
 
 
 def size_from_exif(path: Path) -> tuple[int, int] | None:
-    """Width and height in pixels that the camera wrote, as EXIF has them, or None."""
+    """Width and height in pixels that the camera wrote into EXIF, or None."""
     exif = _exif(path)
     width, height = _positive(exif.get(STORED_WIDTH)), _positive(exif.get(STORED_HEIGHT))
     return (round(width), round(height)) if width and height and min(width, height) >= 1 else None
 
 
+def focal_from_exif(path: Path) -> float | None:
+    """The focal length in pixels of the stored image, or None when EXIF has no believable one.
+
+    From the 35 mm equivalent (which compares diagonals), else from the focal length and the sensor's resolution.
+    """
+    width, height = image_header(path).size
+    if not width:  # it cannot be read, which is reported elsewhere
+        return None
+    exif, long_side = _exif(path), max(width, height)
+    equivalent = _positive(exif.get(FOCAL_LENGTH_35))
+    length, resolution = _positive(exif.get(FOCAL_LENGTH)), _positive(exif.get(PLANE_X_RESOLUTION))
+    unit = PLANE_UNIT_MM.get(exif.get(PLANE_UNIT, 2))
+    focal = 0.0
+    if equivalent:
+        focal = equivalent / FILM_DIAGONAL * math.hypot(width, height)
+    elif length and resolution and unit:
+        stored = max(_positive(exif.get(STORED_WIDTH)) or 0.0, _positive(exif.get(STORED_HEIGHT)) or 0.0) or long_side
+        focal = length * resolution / unit * long_side / stored  # the resolution is for the size that the camera wrote
+    return focal if 0.1 < focal / long_side < 50 else None
+
+
 def _exif(path: Path) -> dict[int, Any]:
-    """The camera's part of EXIF; empty where there is none, or it is broken in a good picture."""
+    """The camera's part of EXIF; empty where there is none, or it is broken in a good image."""
     try:
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")  # Pillow remarks on size and on every oddity of EXIF
-            with Image.open(path) as picture:
-                return dict(picture.getexif().get_ifd(EXIF_FOLDER))
+            with Image.open(path) as image:
+                return dict(image.getexif().get_ifd(EXIF_FOLDER))
     except Exception:  # Pillow raises many families
         return {}
-
-
-def focal_from_exif(path: Path) -> float | None:
-    """The focal length in pixels of the stored picture, or None when EXIF does not tell a believable one.
-
-    From the 35 mm equivalent (which compares diagonals), else from the focal length and the sensor's resolution.
-
-    Raises:
-        InputError: the file is not a picture.
-    """
-    width, height = picture_header(path).size
-    if not width:  # it cannot be read, which is said elsewhere
-        return None
-    exif = _exif(path)
-    equivalent = _positive(exif.get(FOCAL_LENGTH_35))
-    focal: float | None = None
-    if equivalent:
-        focal = equivalent / FILM_DIAGONAL * math.hypot(width, height)
-    else:
-        length, resolution = _positive(exif.get(FOCAL_LENGTH)), _positive(exif.get(PLANE_X_RESOLUTION))
-        unit = PLANE_UNIT_MM.get(exif.get(PLANE_UNIT, 2))
-        if length and resolution and unit:
-            stored = max(_positive(exif.get(STORED_WIDTH)) or 0.0, _positive(exif.get(STORED_HEIGHT)) or 0.0) or max(width, height)
-            focal = length * resolution / unit * max(width, height) / stored  # the resolution is for the size that the camera wrote
-    if focal is None or not 0.1 < focal / max(width, height) < 50:
-        return None
-    return focal
 
 
 def _positive(value: Any) -> float | None:
@@ -220,3 +216,59 @@ def _positive(value: Any) -> float | None:
     except (TypeError, ValueError, ZeroDivisionError, OverflowError):
         return None
     return number if math.isfinite(number) and number > 0 else None
+
+
+# ------------------------------------------------------------------------------------------------ what is not used
+
+
+def with_remark(capture: Capture) -> Capture:
+    """The capture with a warning where it is photos and videos or other programs' poses lie beside them: these may have been meant."""
+    lines = unused(capture) if capture.kind == "photos" else []
+    meant = [line for line in lines if "video" in line or "with poses" in line]
+    return capture.with_frames(capture.frames, f"beside the photos lie and are not used: {'; '.join(meant)}") if meant else capture
+
+
+def unused(capture: Capture) -> list[str]:
+    """A few lines on what a capture's folder holds besides what is used: images, videos, files with poses; each names three at most."""
+    root, own = capture.root, OWN_POSES.get(capture.kind)
+    if capture.film or not root.is_dir():
+        return []
+    of_frames = (path for frame in capture.frames for path in (frame.image, frame.depth, frame.mask, frame.confidence))
+    used = {path.resolve() for path in of_frames if path is not None}
+    images: Counter[str] = Counter()
+    videos: list[str] = []
+    poses: list[str] = []
+    looked = 0
+    for place, children, names in os.walk(root):
+        folder = Path(place)
+        relative = folder.relative_to(root)
+        if "run.json" in names and relative.parts:
+            children.clear()
+            continue
+        children[:] = [] if len(relative.parts) >= 2 else sorted(name for name in children if not name.startswith((".", "__")))
+        looked += len(names) + len(children)
+        if looked > MOST_FILES:
+            break
+        if own is not None and capture.kind != "colmap" and relative.parts and holds_model(folder):
+            poses.append(f"{relative.as_posix()}/ (COLMAP model)")
+        for name in sorted(names, key=natural_key):
+            suffix = Path(name).suffix.lower()
+            known = suffix in (*IMAGES, *VIDEO_SUFFIXES) or POSE_FILES.fullmatch(name)
+            if name.startswith(".") or not known or (folder / name).resolve() in used:
+                continue
+            if suffix in IMAGES:
+                images[relative.as_posix()] += 1
+            elif suffix in VIDEO_SUFFIXES:
+                videos.append((relative / name).as_posix())
+            elif own is not None and not re.fullmatch(own, name, re.IGNORECASE):
+                poses.append((relative / name).as_posix())
+    # Smaller copies of the same images are made by many programs, and nobody means them.
+    heaps = [(place, count) for place, count in images.most_common() if not SMALLER.fullmatch(place.lower())]
+    lines = []
+    if heaps:
+        shown = some_of([f"{count} in {'the folder itself' if place == '.' else place + '/'}" for place, count in heaps])
+        lines.append(f"{counted(sum(count for _, count in heaps), 'image')} ({shown})")
+    for found, one, many in ((videos, "video", "videos"), (poses, "file with poses", "files with poses")):
+        if found:
+            lines.append(f"{counted(len(found), one, many)} ({some_of(found)})")
+    return lines

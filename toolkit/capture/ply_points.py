@@ -19,11 +19,7 @@ ORDERS = {"binary_little_endian": "<", "binary_big_endian": ">", "ascii": ""}
 
 
 def read_ply_points(path: Path) -> Array:
-    """(N, 3) float64 vertex positions; points that are not finite are left out.
-
-    Raises:
-        InputError: not a PLY file whose first element is a plain list of vertices.
-    """
+    """(N, 3) float64 vertex positions; points that are not finite are left out."""
     try:
         if path.stat().st_size > MAX_BYTES:
             raise InputError(f"{path} is larger than {MAX_BYTES / 2**20:.0f} MB; give a sparse point cloud, or none")
@@ -57,19 +53,17 @@ def _parse(content: bytes) -> Array:
             count = int(words[2]) if element == "vertex" else count
         elif words[0] == "property" and element == "vertex":
             columns.append((words[2], ORDERS[order] + TYPES[words[1]]))
-    indices = [[name for name, _ in columns].index(axis) for axis in "xyz"]
+    names = [name for name, _ in columns]
+    indices = [names.index(axis) for axis in "xyz"]
     if count < 0:
         raise ValueError("a negative number of vertices")
     if order == "ascii":
         lines = content[start:].decode("ascii", errors="replace").split("\n", count)[:count]
-        table = [[float(words[i]) for i in indices] for words in (line.split() for line in lines)]
-        points = np.array(table, dtype=np.float64).reshape(-1, 3)
+        points = np.array([[float(words[i]) for i in indices] for words in map(str.split, lines)], dtype=np.float64).reshape(-1, 3)
     else:
         layout = np.dtype(columns)
-        if start + count * layout.itemsize > len(content):
-            raise ValueError("fewer vertices than the header tells")
-        rows = np.frombuffer(content, dtype=layout, count=count, offset=start)
+        rows = np.frombuffer(content, dtype=layout, count=min(count, (len(content) - start) // layout.itemsize), offset=start)
         points = np.stack([rows[axis].astype(np.float64) for axis in "xyz"], axis=1)
     if len(points) != count:
-        raise ValueError("fewer vertices than the header tells")
+        raise ValueError("fewer vertices than in the header")
     return points

@@ -1,6 +1,6 @@
 """Poses as files hold them: quaternions, and matrices that may be rounded, scaled, or no poses at all.
 
-Inside `lenient_poses` one bad frame does not refuse a whole capture: it is noted and left out.
+Inside `lenient_poses` one bad frame does not refuse a whole capture: it is noted and excluded.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ from fieldfuse.errors import InputError
 FARTHEST = 1e12  # of a camera from the origin, in any unit: geocentric millimetres stay below 1e10
 RIGID = 1e-14  # how far RᵀR of a rotation in float64 is from the identity by rounding alone
 TOLERANCE = 0.005  # how far RᵀR may be from 1 anywhere: what single precision and printed digits leave
-ROUNDED = 0.04  # how far R'R may be from 1 where poses are read leniently: numbers of two digits
+ROUNDED = 0.04  # the same where poses are read leniently: numbers of two digits
 _lenient: ContextVar[PoseNotes | None] = ContextVar("lenient poses", default=None)
 
 
@@ -27,16 +27,15 @@ _lenient: ContextVar[PoseNotes | None] = ContextVar("lenient poses", default=Non
 class PoseNotes:
     """What was wrong with poses, and other parts of single frames, that were read leniently."""
 
-    unusable: list[str] = field(default_factory=list)  # a sentence for each pose that came back as NaN
+    unusable: list[str] = field(default_factory=list)  # a sentence for each pose that became NaN
     scales: list[float] = field(default_factory=list)  # of rotations that were scaled
-    rounding: list[float] = field(default_factory=list)  # how far R'R was from 1 where rotations were made rigid
+    rounding: list[float] = field(default_factory=list)  # how far RᵀR was from 1 where rotations were made rigid
     unread: dict[str, str] = field(default_factory=dict)  # frames that could not be read, and why
 
 
 @contextmanager
 def lenient_poses() -> Iterator[PoseNotes]:
-    """Inside, `checked_pose` takes a uniform scale and rounding out of rotations, and answers NaN for a pose that holds nothing usable: one
-    bad pose does not refuse a whole capture. What was done is in the notes."""
+    """Inside, `checked_pose` removes a uniform scale and rounding from rotations, and returns NaN for an unusable pose, with a note."""
     notes = PoseNotes()
     token = _lenient.set(notes)
     try:
@@ -47,7 +46,7 @@ def lenient_poses() -> Iterator[PoseNotes]:
 
 @contextmanager
 def single_frame(name: str) -> Iterator[None]:
-    """What is read inside belongs to one frame: while a capture is read leniently, a failure leaves out this frame and is noted."""
+    """What is read inside belongs to one frame: while a capture is read leniently, a failure excludes this frame and is noted."""
     notes = _lenient.get()
     try:
         yield
@@ -58,25 +57,31 @@ def single_frame(name: str) -> Iterator[None]:
 
 
 def unread_frames() -> dict[str, str]:
-    """Frames of the capture that is being read that could not be, and why."""
+    """Frames of the capture being read that could not be read, and why."""
     notes = _lenient.get()
     return {} if notes is None else notes.unread
 
 
 def reads_leniently() -> bool:
-    """Whether a capture is being read in which single bad parts are left out (`lenient_poses`)."""
     return _lenient.get() is not None
 
 
 def checked_pose(pose: Array, where: str) -> Array:
-    """A rigid float64 (4, 4) pose, re-orthonormalised where it is off, or a clear refusal.
+    """A rigid float64 (4, 4) pose, re-orthonormalised where it is off, or a clear refusal. See `lenient_poses`.
 
-    What is rigid to the last digits stays as it is: a pose that was written and read back is the same pose. See `lenient_poses`.
+    What is rigid to the last digits stays as it is: a pose that was written and read back is the same pose.
 
     Raises:
         InputError: wrong shape, not finite, singular, mirrored, not rigid (beyond `TOLERANCE`) or astronomically far away.
     """
     notes = _lenient.get()
+
+    def unusable(why: str) -> Array:
+        if notes is None:
+            raise InputError(f"{where}: {why}")
+        notes.unusable.append(f"{where}: {why}")
+        return np.full((4, 4), np.nan)
+
     try:
         pose = np.asarray(pose, dtype=np.float64)
     except (TypeError, ValueError) as error:
@@ -86,15 +91,20 @@ def checked_pose(pose: Array, where: str) -> Array:
     if pose.shape != (4, 4):
         raise InputError(f"{where}: the pose has shape {pose.shape}, it must be 4×4")
     if not np.all(np.isfinite(pose)):
-        return _unusable(f"{where}: the pose holds a value that is not finite; remove this frame or correct it", notes)
+        return unusable("the pose holds a value that is not finite; remove this frame or correct it")
     rotation = pose[:3, :3]
     with np.errstate(over="ignore", invalid="ignore"):  # of damaged files: huge numbers are no rotation either
         size, off = np.linalg.det(rotation), np.abs(rotation.T @ rotation - np.eye(3)).max()
-    least = 1e-6 if notes is None else 1e-6 * np.abs(rotation).max() ** 3  # where scale is taken out, a small one is no fault
+    least = 1e-6 if notes is None else 1e-6 * np.abs(rotation).max() ** 3  # where scale is removed, a small one is no fault
     if not abs(size) > least:
-        return _unusable(f"{where}: the pose's rotation is singular; remove this frame or correct it", notes)
-    if notes is not None and size > 0 and not off <= TOLERANCE:
-        rotation, off = _unscaled(rotation, off, notes)
+        return unusable("the pose's rotation is singular; remove this frame or correct it")
+    if notes is not None and size > 0 and not off <= ROUNDED:
+        scale = float(np.cbrt(size))
+        plain = rotation / scale
+        left = float(np.abs(plain.T @ plain - np.eye(3)).max())
+        if left <= ROUNDED:
+            rotation, off = plain, left
+            notes.scales.append(scale)
     if size < 0:
         raise InputError(
             f"{where}: the pose mirrors space (its rotation has determinant < 0); its axis convention is not what this kind of capture uses"
@@ -102,8 +112,7 @@ def checked_pose(pose: Array, where: str) -> Array:
     if notes is not None and TOLERANCE < off <= ROUNDED:
         notes.rounding.append(float(off))
     elif not off <= TOLERANCE:  # NaN, too
-        why = f"its rotation is sheared or its axes differ in length: R'R is {off:.2g} off 1"
-        return _unusable(f"{where}: the pose is not rigid ({why}); correct it", notes)
+        return unusable(f"the pose is not rigid (its rotation is sheared or its axes differ in length: R'R is {off:.2g} off 1); correct it")
     checked_place(pose[:3, 3], where)
     out = np.eye(4)
     if off > RIGID:
@@ -114,31 +123,8 @@ def checked_pose(pose: Array, where: str) -> Array:
     return out
 
 
-def _unusable(why: str, notes: PoseNotes | None) -> Array:
-    """NaN and a note, or a refusal."""
-    if notes is None:
-        raise InputError(why)
-    notes.unusable.append(why)
-    return np.full((4, 4), np.nan)
-
-
-def _unscaled(rotation: Array, off: float, notes: PoseNotes) -> tuple[Array, float]:
-    """The rotation without a uniform scale, if that is what makes it no rotation, and how far R'R is then from 1."""
-    scale = float(np.cbrt(np.linalg.det(rotation)))
-    plain = rotation / scale
-    left = float(np.abs(plain.T @ plain - np.eye(3)).max())
-    if left > ROUNDED or off <= ROUNDED:
-        return rotation, off
-    notes.scales.append(scale)
-    return plain, left
-
-
 def checked_place(place: Array, where: str) -> None:
-    """Look at the translation (3,) of a pose, or of its inverse: what is astronomically far leaves no digits for all else.
-
-    Raises:
-        InputError: further than `FARTHEST` from the origin.
-    """
+    """Refuse a translation (3,) further than `FARTHEST` from the origin: it leaves no digits for all else."""
     farthest = float(np.abs(place).max())
     if not farthest <= FARTHEST:
         raise InputError(

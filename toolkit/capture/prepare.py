@@ -1,18 +1,19 @@
-"""Pictures made ready for fitting and measuring: undistorted and resized once, depth and masks aligned, poses in the working frame."""
+"""Images made ready for fitting and measuring: undistorted and resized once, depth and masks aligned, poses in the working frame."""
 
 from __future__ import annotations
 
 import math
 from collections.abc import Iterable, Iterator
+from dataclasses import replace
 
 import cv2
 import numpy as np
 
 from fieldfuse import memory
 from fieldfuse.camera import Array, Intrinsics, Similarity, resample_maps, undistort_maps
+from fieldfuse.capture.calibration import fitted
 from fieldfuse.capture.images import load_depth, load_image, load_mask, turns_by_exif
 from fieldfuse.capture.listing import natural_key
-from fieldfuse.capture.sizes import fitted
 from fieldfuse.capture.types import Capture, Frame, Views
 from fieldfuse.config import CaptureSettings
 from fieldfuse.errors import InputError
@@ -26,7 +27,7 @@ _MAX_SAMPLES = 4  # samples a pixel and side taken through the lens; what shrink
 def held_out(capture: Capture, holdout: int) -> Array:
     """(N,) bool, True for test views: the source's own split when it has one, else every `holdout`-th frame by name (0, n, 2n, …).
 
-    A `holdout` of 0 gives no test views, unless the source has a split. Training pictures alone (a `transforms_train.json` without others)
+    A `holdout` of 0 gives no test views, unless the source has a split. Training images alone (a `transforms_train.json` without others)
     are no split.
     """
     frames = capture.frames
@@ -39,15 +40,39 @@ def held_out(capture: Capture, holdout: int) -> Array:
     return test
 
 
-def prepare_views(capture: Capture, working_from_input: Similarity, settings: CaptureSettings, progress: Progress = SILENT) -> Views:
-    """Every picture of a posed capture as a pinhole picture in the working frame, its long side `settings.image_size`.
+def limited(capture: Capture, holdout: int, limit: int | None) -> Capture:
+    """`limit` evenly spread training images by name (all when there are no more), and every held-out one; the others are excluded.
 
-    Pictures are never enlarged. Captures with alpha are composited on white before resampling. `valid` leaves out pixels that a
-    mask excludes or that lie outside the lens's picture; `depths` are in working units, taken from the nearest stored value.
+    Held-out images are the same whatever the limit is.
+    """
+    test = held_out(capture, holdout)
+    train = sorted(np.flatnonzero(~test).tolist(), key=lambda index: natural_key(capture.frames[index].name))
+    if limit is None or limit >= len(train):
+        return capture
+    stay = {train[place] for place in evenly(len(train), limit)}
+    return capture.with_frames(
+        replace(frame, split="test" if test[index] else "train")  # with fewer frames every n-th is another
+        for index, frame in enumerate(capture.frames)
+        if test[index] or index in stay
+    )
+
+
+def evenly(count: int, some: int) -> list[int]:
+    """`some` of `count` places, the first and the last among them; the middle one when it is a single one."""
+    if some == 1:
+        return [count // 2]
+    return [int(place) for place in np.unique(np.linspace(0, count - 1, min(some, count)).round().astype(int))]
+
+
+def prepare_views(capture: Capture, working_from_input: Similarity, settings: CaptureSettings, progress: Progress = SILENT) -> Views:
+    """Every image of a posed capture as a pinhole image in the working frame, its long side `settings.image_size`.
+
+    Images are never enlarged. Captures with alpha are composited on white before resampling. `valid` leaves out pixels that a
+    mask excludes or that lie outside the lens's image; `depths` are in working units, taken from the nearest stored value.
     One frame is decoded at a time.
 
     Raises:
-        InputError: a frame without pose or intrinsics, a file that cannot be read, a picture of another shape than its camera, or more
+        InputError: a frame without pose or intrinsics, a file that cannot be read, an image of another shape than its camera, or more
             than there is memory for.
     """
     count = len(capture.frames)
@@ -55,7 +80,7 @@ def prepare_views(capture: Capture, working_from_input: Similarity, settings: Ca
     views = Views([], [], [], np.zeros((0, 4, 4)), held_out(capture, settings.holdout), background=WHITE if capture.alpha else None)
     long_side = settings.image_size or DEFAULT_LONG_SIDE
     size = expected_bytes(capture, long_side)
-    memory.require(size, f"{count} pictures of {capture.root} at {long_side} pixels", "lower --image-size, or give fewer frames")
+    memory.require(size, f"{count} images of {capture.root} at {long_side} pixels", "lower --image-size, or give fewer frames")
     shrink = _Shrinker(long_side)
     exif = turns_by_exif(capture)
     for index, frame in enumerate(capture.frames):
@@ -72,7 +97,7 @@ def prepare_views(capture: Capture, working_from_input: Similarity, settings: Ca
         views.alpha.append(None if alpha is None else np.where(seen, shrink(source, alpha)[1], 0).astype(np.uint8))
         views.valid.append(None if usable.all() else usable)
         views.depths.append(
-            None if frame.depth is None else aligned_depth(frame, capture, source, target) * np.float32(working_from_input.scale)
+            None if frame.depth is None else _aligned_depth(frame, capture, source, target) * np.float32(working_from_input.scale)
         )
         poses.append(working_from_input.poses(frame.world_from_camera))
     views.world_from_camera = np.array(poses, dtype=np.float64).reshape(-1, 4, 4)
@@ -80,8 +105,8 @@ def prepare_views(capture: Capture, working_from_input: Similarity, settings: Ca
     return views
 
 
-def pictures_at(capture: Capture, indices: Iterable[int], long_side: int) -> Iterator[tuple[Intrinsics, Array]]:
-    """The pinhole cameras and pictures (H, W, 3) uint8 of some frames as `prepare_views` makes them, in another size, one at a time.
+def images_at(capture: Capture, indices: Iterable[int], long_side: int) -> Iterator[tuple[Intrinsics, Array]]:
+    """The pinhole cameras and images (H, W, 3) uint8 of some frames as `prepare_views` makes them, in another size, one at a time.
 
     Raises:
         InputError: a frame without intrinsics, or a file that cannot be read.
@@ -97,10 +122,14 @@ def pictures_at(capture: Capture, indices: Iterable[int], long_side: int) -> Ite
 
 
 def _loaded(frame: Frame, camera: Intrinsics, capture: Capture, exif: bool) -> tuple[Intrinsics, Array, Array | None]:
-    """A frame's camera in the size of its file, the picture (H, W, 3) uint8 on white, and its alpha (H, W), if it has one."""
-    picture = load_image(frame, exif=exif)
-    source = fitted(camera, (picture.shape[1], picture.shape[0]), str(frame.image))
-    return (source, *(on_white(picture) if capture.alpha else (np.ascontiguousarray(picture[:, :, :3]), None)))
+    """A frame's camera in the size of its file, the image (H, W, 3) uint8, and its alpha (H, W) if it is composited, on white."""
+    image = load_image(frame, exif=exif)
+    source = fitted(camera, (image.shape[1], image.shape[0]), str(frame.image))
+    if not capture.alpha or image.shape[2] == 3:
+        return source, np.ascontiguousarray(image[:, :, :3]), None
+    alpha = image[:, :, 3:].astype(np.float32) / 255
+    colour = image[:, :, :3].astype(np.float32) * alpha + 255 * (1 - alpha)
+    return source, np.round(colour).astype(np.uint8), np.ascontiguousarray(image[:, :, 3])
 
 
 def expected_bytes(capture: Capture, long_side: int) -> int:
@@ -115,34 +144,21 @@ def expected_bytes(capture: Capture, long_side: int) -> int:
 
 
 def target_size(width: int, height: int, long_side: int) -> tuple[int, int]:
-    """Size of a width × height picture whose long side is brought to `long_side`, never enlarged."""
+    """Size of a width × height image whose long side is brought to `long_side`, never enlarged."""
     factor = min(1.0, long_side / max(width, height))
     return max(1, math.floor(width * factor + 0.5)), max(1, math.floor(height * factor + 0.5))
 
 
-def on_white(picture: Array) -> tuple[Array, Array | None]:
-    """(H, W, 4) RGBA → (H, W, 3) composited on white and (H, W) alpha; (H, W, 3) stays as it is, its alpha None."""
-    if picture.shape[2] == 3:
-        return picture, None
-    alpha = picture[:, :, 3:].astype(np.float32) / 255
-    colour = picture[:, :, :3].astype(np.float32) * alpha + 255 * (1 - alpha)
-    return np.round(colour).astype(np.uint8), np.ascontiguousarray(picture[:, :, 3])
-
-
-def aligned_depth(frame: Frame, capture: Capture, source: Intrinsics, target: Intrinsics) -> Array:
+def _aligned_depth(frame: Frame, capture: Capture, source: Intrinsics, target: Intrinsics) -> Array:
     """The frame's depth seen by the pinhole camera `target`, (H, W) float32 along z in the input's units, 0 = missing.
 
     A depth camera with its own intrinsics is taken to stand where the colour camera does. Then a ray is the same ray in both and
     depth along z stays as it is, so each pixel looks its value up (the nearest one, nothing is mixed across edges): no surface
-    can hide another, and no holes open where the colour picture is finer.
-
-    Raises:
-        InputError: the file cannot be read, or its shape is not its camera's.
+    can hide another, and no holes open where the colour image is finer.
     """
     depth = load_depth(frame, capture)
     height, width = depth.shape
-    camera = fitted(frame.depth_intrinsics or source, (width, height), str(frame.depth))
-    return _nearest(depth, camera, target)
+    return _nearest(depth, fitted(frame.depth_intrinsics or source, (width, height), str(frame.depth)), target)
 
 
 def _nearest(values: Array, camera: Intrinsics, target: Intrinsics) -> Array:
@@ -172,7 +188,7 @@ class _Shrinker:
     """Undistorts and resizes with the anti-aliasing that shrinking needs.
 
     Without a lens: the exact average over each target pixel's area. With one: k × k samples inside each target pixel, each
-    through the lens (bicubic), averaged; k is the number of source pixels a target pixel spans. Maps are kept for the next
+    through the lens (bicubic), averaged; k is the number of source pixels a target pixel spans. Maps are cached for the next
     frame, which mostly has the same camera.
     """
 
@@ -181,24 +197,24 @@ class _Shrinker:
         self.key: tuple[Intrinsics, int, int] | None = None
         self.maps: tuple[Array, Array, Array] | None = None
 
-    def __call__(self, source: Intrinsics, picture: Array) -> tuple[Intrinsics, Array, Array]:
-        """(h, w[, 3]) uint8 of `source` → the pinhole camera, the picture in its size, and (H, W) bool where it shows the scene."""
+    def __call__(self, source: Intrinsics, image: Array) -> tuple[Intrinsics, Array, Array]:
+        """(h, w[, 3]) uint8 of `source` → the pinhole camera, the image in its size, and (H, W) bool where it shows the scene."""
         width, height = target_size(source.width, source.height, self.long_side)
         target = source.pinhole().scaled(width, height)
         if not source.distorted:
             if (width, height) != (source.width, source.height):
-                picture = cv2.resize(picture, (width, height), interpolation=cv2.INTER_AREA)
-            return target, picture, np.ones((height, width), dtype=bool)
+                image = cv2.resize(image, (width, height), interpolation=cv2.INTER_AREA)
+            return target, image, np.ones((height, width), dtype=bool)
         samples = min(_MAX_SAMPLES, math.ceil(source.width / width - 1e-9))
         if source.width > samples * width:
-            picture = cv2.resize(picture, (samples * width, samples * height), interpolation=cv2.INTER_AREA)
+            image = cv2.resize(image, (samples * width, samples * height), interpolation=cv2.INTER_AREA)
             source = source.scaled(samples * width, samples * height)
         if self.key != (source, width, height):
             _, map_x, map_y, seen = undistort_maps(source, samples * width, samples * height)
             whole = np.asarray(seen.reshape(height, samples, width, samples).all(axis=(1, 3)))
             self.key, self.maps = (source, width, height), (map_x, map_y, whole)
         assert self.maps is not None
-        fine_picture = cv2.remap(picture, self.maps[0], self.maps[1], cv2.INTER_CUBIC, borderMode=cv2.BORDER_REPLICATE)
+        fine = cv2.remap(image, self.maps[0], self.maps[1], cv2.INTER_CUBIC, borderMode=cv2.BORDER_REPLICATE)
         if samples > 1:
-            fine_picture = cv2.resize(fine_picture, (width, height), interpolation=cv2.INTER_AREA)
-        return target, fine_picture, self.maps[2]
+            fine = cv2.resize(fine, (width, height), interpolation=cv2.INTER_AREA)
+        return target, fine, self.maps[2]

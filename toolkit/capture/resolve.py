@@ -11,6 +11,7 @@ import os
 import posixpath
 import re
 import unicodedata
+from collections import defaultdict
 from collections.abc import Collection, Iterable, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
@@ -18,24 +19,22 @@ from pathlib import Path
 from urllib.parse import unquote
 
 from fieldfuse import files
-from fieldfuse.capture.listing import PICTURES, counted, is_file
+from fieldfuse.capture.listing import IMAGES, counted, is_file, some_of
 from fieldfuse.errors import InputError, brief
 
 MAX_FILES = 200_000
 MAX_DEPTH = 6
-MAX_PLACES = 2_000_000  # files in all that bear a name looked for: more are no capture
-RUN = "run.json"  # what a run writes into its own folder, whose renders bear the images' names
-SPACES = re.compile(r"\s+")
+MAX_PLACES = 2_000_000  # files in all that have a name looked for: more are no capture
+RUN = "run.json"  # what a run writes into its own folder, whose renders have the images' names
 SMALLER = re.compile(r"(images?|frames|rgb|input)_(2|4|8|16)")  # the same images made smaller
 BESIDE = re.compile(r"mask|depth|disp|normal|semantic|segment|label|confid|thumb|preview")  # folders of what belongs to images and is none
 DEPTH, MASK, POINTS = re.compile("depth|disp"), re.compile("mask|segment|alpha"), re.compile("")
-ANOTHER_MACHINE, LEADS_OUT = "are of another machine", "lead out of the capture's folder"
 SAME, CASE, SUFFIX, UNDERSCORES = range(4)  # how far a file's name is from the listed one
 
 
 @dataclass
 class Found:
-    """Files in the order of the names that were asked for; None where there is none."""
+    """Files in the order of the listed names; None where there is none."""
 
     files: list[Path | None]
     remarks: list[str] = field(default_factory=list)  # on what was found otherwise than listed; at most one a kind
@@ -53,7 +52,31 @@ class _Name:
     listed: str
     folder: tuple[str, ...]
     name: str
-    foreign: str  # why its folder means nothing here: ANOTHER_MACHINE or LEADS_OUT, else empty
+    foreign: str  # why its folder means nothing here, else empty
+
+    @classmethod
+    def of(cls, base: str, listed: str) -> _Name:
+        """Steps up that lead out are dropped, what stands behind them remains."""
+        slashes = listed.replace("\\", "/")
+        foreign = "are of another machine" if re.match(r"/|[A-Za-z][A-Za-z+.-]*:", slashes) else ""
+        parts: list[str] = []
+        for part in ("" if foreign else base + "/").split("/") + slashes.split("/"):
+            if part == "..":
+                foreign = foreign or ("" if parts else "lead out of the capture's folder")
+                parts = parts[:-1]
+            elif part not in ("", "."):
+                parts.append(part)
+        return cls(listed, tuple(map(_fold, parts[:-1])), parts[-1] if parts else "", foreign)
+
+
+@dataclass
+class _Search:
+    """One call of `CaptureFiles.find`."""
+
+    source: str  # what lists the names, for messages
+    kind: re.Pattern[str] | None
+    used: set[Path]  # files that stand for a name already
+    twice: set[str] = field(default_factory=set)  # keys of names that are listed in several folders
 
 
 class CaptureFiles:
@@ -81,53 +104,43 @@ class CaptureFiles:
             anywhere: also in other folders than the listed ones.
             kind: for what is no image (DEPTH, MASK, POINTS): the word by which its folder is known where it has another name.
             taken: files that stand for something else.
-
-        Raises:
-            InputError: two folders or files fit equally well, or a link leads outside the capture's folder.
         """
-        chosen: dict[str, Path] = {}
-        for listed in dict.fromkeys(names):
-            if (exact := self._exact(base, listed)) is not None:
-                chosen[listed] = exact
-        missing = [_parsed(base, listed) for listed in dict.fromkeys(names) if listed not in chosen]
+        parsed = [_Name.of(base, listed) for listed in dict.fromkeys(names)]
+        chosen = {name.listed: exact for name in parsed if (exact := self._exact(base, name.listed)) is not None}
+        at_home = {name.folder for name in parsed if name.listed in chosen}
+        groups: dict[tuple[str, ...], list[_Name]] = defaultdict(list)
+        folders_of: dict[str, set[tuple[str, ...]]] = defaultdict(set)
+        for name in parsed:
+            if name.listed not in chosen:
+                groups[name.folder].append(name)
+                folders_of[_key(name.name)].add(name.folder)
+        # Of two folders (`cam1/1.jpg`, `cam2/1.jpg`) one alone left might be either.
+        search = _Search(source, kind, {*chosen.values(), *taken}, {key for key, of in folders_of.items() if len(of) > 1})
         moved: list[tuple[_Name, str]] = []
         spelled: list[tuple[_Name, str]] = []
         outside = 0
-        if missing:
-            used = {*chosen.values(), *taken}
-            at_home = {_parsed(base, listed).folder for listed in chosen}
-            groups: dict[tuple[str, ...], list[_Name]] = {}
-            for name in missing:
-                groups.setdefault(name.folder, []).append(name)
-            listed_in: dict[str, set[tuple[str, ...]]] = {}
-            for name in missing:
-                listed_in.setdefault(_key(name.name), set()).add(name.folder)
-            # Of two folders (`cam1/1.jpg`, `cam2/1.jpg`) one alone left might be either.
-            twice = {key for key, of in listed_in.items() if len(of) > 1}
-            for folder, group in groups.items():
-                before = len(chosen)
-                elsewhere = anywhere and folder not in at_home
-                for name, place, quality in self._relocated(folder, group, used, twice, elsewhere, kind, source):
-                    path = files.inside(self.root, place)
-                    used.add(path)
-                    chosen[name.listed] = path
-                    if name.foreign or _folded(posixpath.dirname(place)) != folder:
-                        moved.append((name, posixpath.dirname(place)))
-                    elif quality in (CASE, SUFFIX):
-                        spelled.append((name, posixpath.basename(place)))
-                outside += sum(bool(name.foreign) for name in group) if len(chosen) == before else 0
-        return Found([chosen.get(name) for name in names], _remarks(moved, spelled, source, kind), outside)
+        for folder, group in groups.items():
+            before = len(chosen)
+            for name, place, quality in self._relocated(search, folder, group, anywhere and folder not in at_home):
+                path = files.inside(self.root, place)
+                search.used.add(path)
+                chosen[name.listed] = path
+                if name.foreign or _folded(posixpath.dirname(place)) != folder:
+                    moved.append((name, posixpath.dirname(place)))
+                elif quality in (CASE, SUFFIX):
+                    spelled.append((name, posixpath.basename(place)))
+            outside += sum(bool(name.foreign) for name in group) if len(chosen) == before else 0
+        return Found([chosen.get(name) for name in names], _remarks(moved, spelled, search), outside)
 
     def none_exists(self, source: str, count: int, found: Found) -> InputError:
         """That none of the `count` images that `source` lists is there, with what is there instead."""
         held = [(folder, [name for name in names if _split(name)[1]]) for folder, names in self._listing.items()]
         there = [f"{folder or '.'}/ holds {counted(len(names), 'image')} ({names[0]}, …)" for folder, names in held if names]
-        instead = f"; {', '.join(there[:2])}" if there else ""
+        what = "put them there or correct the paths"
         if found.outside:
-            instead = f", and their paths lead outside the capture folder; give the folder that holds both, or correct the paths{instead}"
-        else:
-            instead = f"; put them there or correct the paths{instead}"
-        return InputError(f"none of the {counted(count, 'image')} listed in {source} exists below {self.root}{instead}")
+            what = "and their paths lead outside the capture folder; give the folder that holds both, or correct the paths"
+        text = f"none of the {counted(count, 'image')} listed in {source} exists below {self.root}{',' if found.outside else ';'} {what}"
+        return InputError(f"{text}; {', '.join(there[:2])}" if there else text)
 
     def find_beside(
         self, listed: Sequence[str | None], kind: re.Pattern[str], taken: Collection[Path], source: str, base: str = ""
@@ -162,96 +175,86 @@ class CaptureFiles:
     @cached_property
     def _by_key(self) -> dict[tuple[str, str], list[tuple[str, str]]]:
         """Folder and name of files by the name of their folder and their key, and by their key alone (under an empty folder's name)."""
-        out: dict[tuple[str, str], list[tuple[str, str]]] = {}
+        out: dict[tuple[str, str], list[tuple[str, str]]] = defaultdict(list)
         for folder, names in self._listing.items():
             last = _last(_folded(folder) or _folded(self.root.name))
             for name in names:
                 for place in {last, ""}:
-                    out.setdefault((place, _key(name)), []).append((folder, name))
+                    out[place, _key(name)].append((folder, name))
         return out
 
     def _exact(self, base: str, name: str) -> Path | None:
         slashes = name.replace("\\", "/")
         for spelling in dict.fromkeys((name, slashes, unquote(slashes))):
-            path = self._inside(posixpath.join(base, spelling))
-            if path is None:
-                continue
+            relative = posixpath.join(base, spelling)
+            try:
+                path = files.inside(self.root, relative)
+            except InputError:
+                if Path(os.path.normpath(self.root / relative)).is_relative_to(self.root):
+                    raise  # it is a link, or no path at all
+                continue  # the text itself leads outside
             if is_file(path):
                 return path
-            for suffix in () if _split(path.name)[1] else PICTURES:
+            for suffix in () if _split(path.name)[1] else IMAGES:
                 for variant in (suffix, suffix.upper()):
                     if is_file(candidate := Path(f"{path}{variant}")):
                         return files.inside(self.root, str(candidate))
         return None
 
-    def _inside(self, relative: str) -> Path | None:
-        """The place below the root; None where the text itself leads outside.
-
-        Raises:
-            InputError: it is a link, or no path at all.
-        """
-        try:
-            return files.inside(self.root, relative)
-        except InputError:
-            if Path(os.path.normpath(self.root / relative)).is_relative_to(self.root):
-                raise
-            return None
-
     def _relocated(
-        self,
-        listed: tuple[str, ...],
-        group: list[_Name],
-        used: set[Path],
-        twice: set[str],
-        elsewhere: bool,
-        kind: re.Pattern[str] | None,
-        source: str,
+        self, search: _Search, listed: tuple[str, ...], group: list[_Name], elsewhere: bool
     ) -> Iterable[tuple[_Name, str, int]]:
         """Names of one listed folder with the place of their file below the root, and how far its name is from the listed one."""
         ranks: dict[str, tuple[int, int, int]] = {}
-        hits: dict[str, dict[str, tuple[str, int]]] = {}  # folder → listed name → file's name and distance
+        hits: dict[str, dict[str, tuple[str, int]]] = defaultdict(dict)  # folder → listed name → file's name and distance
         for name in group:
-            by_folder: dict[str, list[str]] = {}
             key = _key(name.name)
             alike = self._by_key.get((_last(listed), key)) or self._by_key.get(("", key), [])
             self._looked += len(alike)
             if self._looked > MAX_PLACES:
-                raise InputError(f"{self.root} holds too many files of the same names to tell which {source} lists; give one capture")
+                raise InputError(f"{self.root} holds too many files of the same names as those in {search.source}; give one capture")
+            by_folder: dict[str, list[str]] = defaultdict(list)
             for folder, file in alike:
-                by_folder.setdefault(folder, []).append(file)
+                by_folder[folder].append(file)
             for folder, candidates in by_folder.items():
                 if folder not in ranks:
                     ranks[folder] = _rank(listed, _folded(folder), self.root)
-                if not _eligible(listed, _folded(folder), name, ranks[folder], elsewhere, kind) or (key in twice and ranks[folder][0] == 0):
+                related = ranks[folder][0] > 0
+                if not self._eligible(search, name, folder, related, elsewhere) or (key in search.twice and not related):
                     continue
-                best = self._nearest(name, folder, candidates, used, source)
-                if best is not None:
-                    hits.setdefault(folder, {})[name.listed] = best
+                if (best := self._nearest(search, name, folder, candidates)) is not None:
+                    hits[folder][name.listed] = best
         left = {name.listed: name for name in group}
         for rank in sorted({ranks[folder] for folder in hits}, reverse=True):
-            here = [folder for folder in hits if ranks[folder] == rank]
-            level = {folder: {name: hit for name, hit in hits[folder].items() if name in left} for folder in here}
-            places_of: dict[str, list[str]] = {}
+            level = {folder: {one: hit for one, hit in hits[folder].items() if one in left} for folder in hits if ranks[folder] == rank}
+            places_of: dict[str, list[str]] = defaultdict(list)
             for folder, found in level.items():
                 for listed_name in found:
-                    places_of.setdefault(listed_name, []).append(folder)
+                    places_of[listed_name].append(folder)
             decided: dict[tuple[str, ...], str | None] = {}
             for listed_name, places in places_of.items():
-                name = left[listed_name]
                 if tuple(places) not in decided:
-                    decided[tuple(places)] = self._one_of(places, level, name, source, kind)
+                    decided[tuple(places)] = self._one_of(search, places, level, left[listed_name])
                 place = decided[tuple(places)]
-                if place is None:
-                    continue
-                file, quality = level[place][listed_name]
-                del left[listed_name]
-                yield name, posixpath.join(place, file), quality
+                if place is not None:
+                    file, quality = level[place][listed_name]
+                    yield left.pop(listed_name), posixpath.join(place, file), quality
             if rank[0]:  # in a folder of the listed name; what is not there may be anything elsewhere
                 return
 
-    def _nearest(self, name: _Name, folder: str, candidates: list[str], used: set[Path], source: str) -> tuple[str, int] | None:
+    @staticmethod
+    def _eligible(search: _Search, name: _Name, folder: str, related: bool, elsewhere: bool) -> bool:
+        """Whether a listed file may lie in this folder: in its own, in any `related` one, or in one whose name does not exclude it."""
+        folded = _folded(folder)
+        if name.folder == folded or not elsewhere:
+            return name.folder == folded
+        if search.kind is not None:
+            return related or search.kind.search("/".join((*folded, _fold(name.name)))) is not None
+        return not any(BESIDE.search(part) and part not in name.folder for part in folded)
+
+    def _nearest(self, search: _Search, name: _Name, folder: str, candidates: list[str]) -> tuple[str, int] | None:
         """The file of `folder` whose name is nearest to the listed one; None for none, or several with spaces for underscores."""
-        free = [file for file in candidates if self.root / folder / file not in used]
+        free = [file for file in candidates if self.root / folder / file not in search.used]
         graded = sorted((_distance(name.name, file), _suffix_order(file), file) for file in free)
         if not graded:
             return None
@@ -260,26 +263,23 @@ class CaptureFiles:
             if quality == UNDERSCORES:
                 return None
             raise InputError(
-                f"{self.root}: {brief(repr(name.listed))}, listed in {source}, may be {file} or {graded[1][2]} of {folder or '.'}/; "
+                f"{self.root}: {brief(repr(name.listed))}, listed in {search.source}, may be {file} or {graded[1][2]} of {folder or '.'}/; "
                 "remove or rename the other"
             )
         return file, quality
 
-    def _one_of(
-        self, places: list[str], level: dict[str, dict[str, tuple[str, int]]], name: _Name, source: str, kind: re.Pattern[str] | None
-    ) -> str | None:
+    def _one_of(self, search: _Search, places: list[str], level: dict[str, dict[str, tuple[str, int]]], name: _Name) -> str | None:
         """The folder that a name is taken from: the one that also serves all other names which any of them serves."""
-        ordered = sorted(places, key=lambda folder: (-len(level[folder]), *_usual(folder), folder))
-        best = ordered[0]
-        for other in ordered[1:]:
+        best, *others = sorted(places, key=lambda folder: (-len(level[folder]), *_usual(folder), folder))
+        for other in others:
             more = level[best].keys() > level[other].keys()
             same_images = level[best].keys() >= level[other].keys() and _usual(best) < _usual(other)
             if not more and not same_images:
-                if kind is not None:
+                if search.kind is not None:
                     return None
                 raise InputError(
-                    f"{self.root}: {brief(repr(name.listed))}, listed in {source}, may be the one in {best or '.'}/ or in {other or '.'}/; "
-                    "give the folder that belongs to it, or correct the paths"
+                    f"{self.root}: {brief(repr(name.listed))}, listed in {search.source}, may be the one in {best or '.'}/ or in "
+                    f"{other or '.'}/; give the folder that belongs to it, or correct the paths"
                 )
         return best
 
@@ -288,21 +288,26 @@ def _parts(path: str) -> tuple[str, ...]:
     return tuple(part for part in path.split("/") if part)
 
 
-def _folded(path: str) -> tuple[str, ...]:
-    """Folders of a path in the one spelling in which they are compared."""
-    return tuple(_fold(part) for part in _parts(path))
-
-
-def _last(folders: tuple[str, ...]) -> str:
-    return _without_factor(folders[-1]) if folders else ""
-
-
 def _fold(part: str) -> str:
-    return SPACES.sub("_", _plain(part).casefold())
+    """The one spelling in which names are compared."""
+    return re.sub(r"\s+", "_", _plain(part).casefold())
+
+
+def _folded(path: str) -> tuple[str, ...]:
+    return tuple(map(_fold, _parts(path)))
 
 
 def _plain(part: str) -> str:
     return unicodedata.normalize("NFC", unquote(part))
+
+
+def _without_factor(folder: str) -> str:
+    match = SMALLER.fullmatch(folder)
+    return match[1] if match else folder
+
+
+def _last(folders: tuple[str, ...]) -> str:
+    return _without_factor(folders[-1]) if folders else ""
 
 
 def _key(name: str) -> str:
@@ -312,12 +317,12 @@ def _key(name: str) -> str:
 def _split(name: str) -> tuple[str, str]:
     """Stem and suffix of a file's name; the suffix is empty where it is not an image's."""
     stem, suffix = posixpath.splitext(name)
-    return (stem, suffix) if suffix.lower() in PICTURES else (name, "")
+    return (stem, suffix) if suffix.lower() in IMAGES else (name, "")
 
 
 def _suffix_order(file: str) -> int:
     suffix = _split(file)[1].lower()
-    return PICTURES.index(suffix) if suffix else 0
+    return IMAGES.index(suffix) if suffix else 0
 
 
 def _distance(listed: str, file: str) -> int:
@@ -325,30 +330,9 @@ def _distance(listed: str, file: str) -> int:
     (stem, suffix), (other, others) = _split(_plain(listed)), _split(_plain(file))
     if stem.casefold() != other.casefold():
         return UNDERSCORES
-    if not suffix:
-        return SAME if stem == other else CASE
-    if suffix.lower() != others.lower():
+    if suffix and suffix.lower() != others.lower():
         return SUFFIX
-    return SAME if (stem, suffix) == (other, others) else CASE
-
-
-def _parsed(base: str, listed: str) -> _Name:
-    """The parts of a listed path; steps up that lead out are dropped, what stands behind them remains."""
-    slashes = listed.replace("\\", "/")
-    foreign = ANOTHER_MACHINE if slashes.startswith("/") or re.match(r"[A-Za-z][A-Za-z+.-]*:", slashes) else ""
-    parts: list[str] = []
-    for part in ("" if foreign else base + "/").split("/") + slashes.split("/"):
-        if part == "..":
-            foreign = foreign or ("" if parts else LEADS_OUT)
-            parts = parts[:-1]
-        elif part not in ("", "."):
-            parts.append(part)
-    return _Name(listed, tuple(map(_fold, parts[:-1])), parts[-1] if parts else "", foreign)
-
-
-def _without_factor(folder: str) -> str:
-    match = SMALLER.fullmatch(folder)
-    return match[1] if match else folder
+    return SAME if stem == other and suffix in ("", others) else CASE
 
 
 def _rank(listed: tuple[str, ...], folder: tuple[str, ...], root: Path) -> tuple[int, int, int]:
@@ -358,52 +342,28 @@ def _rank(listed: tuple[str, ...], folder: tuple[str, ...], root: Path) -> tuple
         if _without_factor(one) != _without_factor(two):
             break
         both, exact = both + 1, exact + (one == two)
-    common = {_without_factor(part) for part in listed} & {_without_factor(part) for part in folder}
-    return both, exact, len(common)
+    return both, exact, len({_without_factor(part) for part in listed} & {_without_factor(part) for part in folder})
 
 
-def _eligible(
-    listed: tuple[str, ...],
-    folder: tuple[str, ...],
-    name: _Name,
-    rank: tuple[int, int, int],
-    elsewhere: bool,
-    kind: re.Pattern[str] | None,
-) -> bool:
-    if listed == folder:
-        return True
-    if not elsewhere:
-        return False
-    if kind is not None:
-        return rank[0] > 0 or kind.search("/".join((*folder, _fold(name.name)))) is not None
-    return not any(BESIDE.search(part) and part not in listed for part in folder)
-
-
-def _usual(folder: str) -> tuple[int, int, str]:
+def _usual(folder: str) -> tuple[int, int]:
     """Order of folders that hold images of the same names: `images`, then the same made smaller, by how much; else none."""
     parent, name = posixpath.split(folder)
     match = SMALLER.fullmatch(name.lower())
     if name.lower() == "images" or (match and match[1] == "images"):
-        return (0 if not parent else 1), int(match[2]) if match else 1, ""
-    return 2, 0, ""
+        return (0 if not parent else 1), int(match[2]) if match else 1
+    return 2, 0
 
 
-def _remarks(
-    moved: list[tuple[_Name, str]], spelled: list[tuple[_Name, str]], source: str, kind: re.Pattern[str] | None
-) -> list[str]:
-    what, out = "image" if kind is None else "listed file", []
+def _remarks(moved: list[tuple[_Name, str]], spelled: list[tuple[_Name, str]], search: _Search) -> list[str]:
+    what, out = "image" if search.kind is None else "listed file", []
     if moved:
-        places = list(dict.fromkeys(f"{place or '.'}/" for _, place in moved))
-        where = ", ".join(places[:3]) + (", …" if len(places) > 3 else "")
-        count = counted(len(moved), f"{what} was", f"{what}s were")
-        if all(name.foreign for name, _ in moved):
-            why = f"since the paths listed in {source} {moved[0][0].foreign}"
-        else:
-            why = f"where {source} does not list them"
-        out.append(f"{count} found by their names in {where}, {why}")
+        where = some_of(list(dict.fromkeys(f"{place or '.'}/" for _, place in moved)))
+        foreign = all(name.foreign for name, _ in moved)
+        why = f"since the paths listed in {search.source} {moved[0][0].foreign}" if foreign else f"where {search.source} does not list them"
+        out.append(f"{counted(len(moved), f'{what} was', f'{what}s were')} found by their names in {where}, {why}")
     if spelled:
         name, file = spelled[0]
         count = counted(len(spelled), f"{what} was", f"{what}s were")
-        listed = posixpath.basename(name.listed.replace("\\", "/"))
-        out.append(f"{count} found under another spelling than in {source} (letter case or extension): {file} for {brief(repr(listed))}")
+        listed = brief(repr(posixpath.basename(name.listed.replace("\\", "/"))))
+        out.append(f"{count} found under another spelling than in {search.source} (letter case or extension): {file} for {listed}")
     return out

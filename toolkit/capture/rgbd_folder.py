@@ -16,24 +16,24 @@ from pathlib import Path
 import numpy as np
 
 from fieldfuse.camera import OPENCV, Array, Intrinsics
-from fieldfuse.capture.calibration import from_matrix, sensor
+from fieldfuse.capture.calibration import fitted, from_matrix, posed_frame, sensor, usable_size
 from fieldfuse.capture.depth_checks import Sample, unit_factor
-from fieldfuse.capture.images import load_depth
+from fieldfuse.capture.headers import image_size
+from fieldfuse.capture.images import load_depth, spread
 from fieldfuse.capture.listing import (
-    PICTURES,
+    IMAGES,
     assemble,
     counted,
     files_in,
+    images_in,
     natural_key,
-    pictures_in,
-    posed_frame,
     read_text,
     require_folder,
     unique_names,
+    words_of,
 )
 from fieldfuse.capture.masks import is_mask_folder
 from fieldfuse.capture.poses import rigid
-from fieldfuse.capture.sizes import first_size, fitted
 from fieldfuse.capture.types import Capture
 from fieldfuse.errors import InputError
 
@@ -41,8 +41,9 @@ DEPTH_WORDS, COLOUR_WORDS = {"depth", "depths"}, {"rgb", "color", "colors", "col
 NO_COLOUR = {*DEPTH_WORDS, "normal", "normals", "confidence", "conf", "semantic", "label", "labels", "instance", "vis"}
 POSE_WORDS = {"pose", "poses", "traj", "trajectory", "groundtruth", "gt", "extrinsics", "extrinsic", "odometry", "camera", "cam", "cameras"}
 CAMERA_WORDS = {"intrinsic", "intrinsics", "camera", "cam", "calib", "calibration", "k"}
-DEPTH_FILES = (*PICTURES, ".npy", ".pfm", ".pgm", ".exr")
+DEPTH_FILES = (*IMAGES, ".npy", ".pfm", ".pgm", ".exr")
 POSE_FILES = ("*.txt", "*.log", "*.csv", "*.tum")
+CAMERA_FILES = ("*.yaml", "*.yml", "*.json", "*.txt", "*.cfg")
 NUMBER = re.compile(r"[-+]?(?:[0-9]+\.?[0-9]*|\.[0-9]+)(?:[eE][-+]?[0-9]+)?")
 WORD = re.compile(rf"{NUMBER.pattern}|[-+]?(?:nan|inf|infinity)", re.IGNORECASE)  # of a pose
 MOST_CAMERA = 2**18  # bytes of a file that holds a camera
@@ -51,6 +52,7 @@ MILLIMETRES = 1000.0
 LOOKED_AT = 12  # depth maps that the unit is found by
 MOST_FOLDERS = 200
 DEPTH_FACTORS = ("depthmapfactor", "depth_scale", "depth_factor", "png_depth_scale")
+LENS = ("fx", "fy", "cx", "cy")
 VALUE = re.compile(r"""\b([A-Za-z_][\w.]{0,60})["']?[ \t]{0,20}[:=]\s{0,99}(\[[^\]]{0,2000}\]|[-+.0-9eE]{1,40})""")
 
 
@@ -85,15 +87,15 @@ def read_rgbd(path: Path | str) -> Capture:
     layout = _layout(root)
     if layout is None:
         raise InputError(f"{root} must hold a folder of colour images, one of depth maps (depth/) and a list of poses")
-    images = pictures_in(layout.colour)
-    depths = _depths_of(images, pictures_in(layout.depth, DEPTH_FILES), root)
+    images = images_in(layout.colour)
+    depths = _depths_of(images, images_in(layout.depth, DEPTH_FILES), root)
     poses = _poses_of(images, layout.poses, root)
-    camera, scale, source = _camera(root, layout, first_size(images))
+    camera, scale, source = _camera(root, layout, image_size(images[0], images))
     frames = []
     for index, (image, name) in enumerate(zip(images, unique_names(images), strict=True)):
-        if index not in poses or not np.isfinite(poses[index]).all():
-            continue
-        frames.append(posed_frame(name, image, camera, poses[index], f"{layout.poses.file}, the pose of {image.name}", depths.get(index)))
+        if index in poses and np.isfinite(poses[index]).all():
+            where = f"{layout.poses.file}, the pose of {image.name}"
+            frames.append(posed_frame(name, image, camera, poses[index], where, depths.get(index)))
     places = f"{layout.colour.relative_to(root)}/, {layout.depth.relative_to(root)}/, {layout.poses.file.relative_to(root)} and {source}"
     warnings = [f"read as RGB-D from {places}; poses are taken as camera-to-world"]
     if len(frames) < len(images):
@@ -103,10 +105,6 @@ def read_rgbd(path: Path | str) -> Capture:
 
 
 # ------------------------------------------------------------------------------------------------ what lies where
-
-
-def _words(name: str) -> set[str]:
-    return set(re.findall(r"[a-z]+", re.sub(r"([a-z])([A-Z])", r"\1 \2", name).lower()))
 
 
 def _folders(root: Path) -> list[Path]:
@@ -120,14 +118,15 @@ def _folders(root: Path) -> list[Path]:
 
 
 def _layout(root: Path) -> _Layout | None:
-    folders = _folders(root)
+    everything = _folders(root)
+    folders = [folder for folder in everything if not is_mask_folder(folder.name)]
     for depth in folders:
-        if not _words(depth.name) & DEPTH_WORDS or is_mask_folder(depth.name) or len(pictures_in(depth, DEPTH_FILES)) < 2:
+        if not words_of(depth.name) & DEPTH_WORDS or len(images_in(depth, DEPTH_FILES)) < 2:
             continue
-        beside = [folder for folder in folders if folder.parent == depth.parent and not _words(folder.name) & NO_COLOUR]
+        beside = [folder for folder in everything if folder.parent == depth.parent and not words_of(folder.name) & NO_COLOUR]
         ranked = sorted(
-            (folder for folder in beside if not is_mask_folder(folder.name) and len(pictures_in(folder)) > 1),
-            key=lambda folder: (not _words(folder.name) & COLOUR_WORDS, -len(pictures_in(folder))),
+            (folder for folder in beside if folder in folders and len(images_in(folder)) > 1),
+            key=lambda folder: (not words_of(folder.name) & COLOUR_WORDS, -len(images_in(folder))),
         )
         poses = _find_poses([depth.parent, root], beside) if ranked else None
         if poses is not None:
@@ -138,14 +137,14 @@ def _layout(root: Path) -> _Layout | None:
 def _find_poses(places: Sequence[Path], folders: Sequence[Path]) -> _Poses | None:
     """The first list of poses among files named so, or the folder of one matrix a file."""
     for place in dict.fromkeys(places):
-        named = {file for pattern in POSE_FILES for file in files_in(place, pattern) if _words(file.stem) & POSE_WORDS}
-        for file in sorted(named, key=lambda file: (not _words(file.stem) & {"pose", "poses"}, natural_key(file.name))):
+        named = {file for pattern in POSE_FILES for file in files_in(place, pattern) if words_of(file.stem) & POSE_WORDS}
+        for file in sorted(named, key=lambda file: (not words_of(file.stem) & {"pose", "poses"}, natural_key(file.name))):
             matrices, keys = _parse(file)
             if len(matrices) > 1:
                 return _Poses(file, matrices, keys)
     for folder in folders:
         files = sorted(files_in(folder, "*.txt"), key=lambda file: natural_key(file.name))
-        if _words(folder.name) & POSE_WORDS and len(files) > 1:
+        if words_of(folder.name) & POSE_WORDS and len(files) > 1:
             one = [_parse(file)[0] for file in files]
             if all(len(matrices) == 1 for matrices in one):
                 return _Poses(folder, np.concatenate(one), [file.stem for file in files])
@@ -162,10 +161,9 @@ def _parse(file: Path) -> tuple[Array, list[str]]:
     rows: list[tuple[list[str], list[float]]] = []
     for line in text.splitlines():
         words = re.sub(r"[,;\[\]]", " ", line.split("#")[0]).split()
-        if not words:
-            continue
-        count = next((at for at, word in enumerate(reversed(words)) if not WORD.fullmatch(word)), len(words))
-        rows.append((words[: len(words) - count], [float(word) for word in words[len(words) - count :]]))
+        if words:
+            count = next((at for at, word in enumerate(reversed(words)) if not WORD.fullmatch(word)), len(words))
+            rows.append((words[: len(words) - count], [float(word) for word in words[len(words) - count :]]))
     rows = rows[1:] if rows and not rows[0][1] else rows  # a table's heading
     if not rows or len({len(numbers) for _, numbers in rows}) != 1 or any(len(before) > 1 for before, _ in rows):
         return none
@@ -173,28 +171,27 @@ def _parse(file: Path) -> tuple[Array, list[str]]:
     width = table.shape[1]
     keys = [before[0] for before, _ in rows] if all(before for before, _ in rows) else []
     if width == 4 and not keys and len(table) % 4 == 0:
-        return _whole(table.reshape(-1, 4, 4)), []
+        return _by_rows(table.reshape(-1, 4, 4)), []
     if width in (8, 13, 17) and not keys:
         keys, table, width = [repr(float(value)) for value in table[:, 0]], table[:, 1:], width - 1
     if width == 16:
-        return _whole(table.reshape(-1, 4, 4)), keys
+        return _by_rows(table.reshape(-1, 4, 4)), keys
+    out = np.full((len(table), 4, 4), np.nan)
     if width == 12:
-        bottom = np.tile([[[0.0, 0.0, 0.0, 1.0]]], (len(table), 1, 1))
-        return np.concatenate([table.reshape(-1, 3, 4), bottom], axis=1), keys
+        out[:, :3], out[:, 3] = table.reshape(-1, 3, 4), (0, 0, 0, 1)
+        return out, keys
     if width == 7:
-        out = np.full((len(table), 4, 4), np.nan)
         for at in np.flatnonzero(np.isfinite(table).all(axis=1) & (np.abs(table[:, 3:]).max(axis=1) > 0)):
             out[at] = rigid(table[at, [6, 3, 4, 5]], table[at, :3], f"{file}, row {at + 1}")
         return out, keys
     return none
 
 
-def _whole(matrices: Array) -> Array:
+def _by_rows(matrices: Array) -> Array:
     """The matrices, of those written column by column transposed; none where they are no poses."""
-    last = np.array([0.0, 0.0, 0.0, 1.0])
     finite = np.isfinite(matrices).all(axis=(1, 2))
     for some in (matrices, matrices.transpose(0, 2, 1)):
-        if finite.any() and np.allclose(some[finite, 3], last, atol=1e-6):
+        if finite.any() and np.allclose(some[finite, 3], [0, 0, 0, 1], atol=1e-6):
             return some
     return matrices[:0]
 
@@ -203,7 +200,7 @@ def _whole(matrices: Array) -> Array:
 
 
 def _numbers(paths: Sequence[Path]) -> list[tuple[int, ...]] | None:
-    """The numbers in each name that are not the same in all; None where they do not tell the files apart."""
+    """The numbers in each name that are not the same in all; None where they do not distinguish the files."""
     found = [tuple(int(number) for number in re.findall(r"[0-9]{1,18}", path.stem)) for path in paths]
     if len({len(numbers) for numbers in found}) != 1:
         return None
@@ -259,26 +256,25 @@ def _depths_of(images: Sequence[Path], depths: Sequence[Path], root: Path) -> di
 def _poses_of(images: Sequence[Path], poses: _Poses, root: Path) -> dict[int, Array]:
     """Index of an image → its pose: by name, by time or number, by row."""
     pairs: dict[int, int] = {}
+    numbers = _numbers(images)
+    single = [one[0] for one in numbers] if numbers is not None and len(numbers[0]) == 1 else None
     if poses.keys:
-        pairs = _pairs(images, [Path(key.replace("\\", "/")) for key in poses.keys]) if _times(poses.keys) is None else {}
         mine, theirs = _times([image.stem for image in images]), _times(poses.keys)
-        numbers = _numbers(images)
-        if not pairs and theirs is not None:
-            if mine is not None and (theirs % 1 != 0).any():
-                pairs = _nearest(mine, theirs)
-            elif numbers is not None and len(numbers[0]) == 1 and (theirs % 1 == 0).all():
-                place = {int(key): at for at, key in enumerate(theirs)}
-                pairs = {index: place[number] for index, (number,) in enumerate(numbers) if number in place}
+        if theirs is None:
+            pairs = _pairs(images, [Path(key.replace("\\", "/")) for key in poses.keys])
+        elif mine is not None and (theirs % 1 != 0).any():
+            pairs = _nearest(mine, theirs)
+        elif single is not None and (theirs % 1 == 0).all():
+            place = {int(key): at for at, key in enumerate(theirs)}
+            pairs = {index: place[number] for index, number in enumerate(single) if number in place}
     if not pairs and len(images) == len(poses.matrices):
         pairs = {index: index for index in range(len(images))}
-    if not pairs and not poses.keys:
-        numbers = _numbers(images)
-        if numbers is not None and len(numbers[0]) == 1 and max(numbers)[0] < len(poses.matrices):
-            pairs = {index: number for index, (number,) in enumerate(numbers)}  # every n-th frame of a longer list
+    if not pairs and not poses.keys and single is not None and max(single) < len(poses.matrices):
+        pairs = dict(enumerate(single))  # every n-th frame of a longer list
     if not pairs:
         raise InputError(
             f"{root} holds {counted(len(images), 'image')} but {poses.file.name} {counted(len(poses.matrices), 'pose')}, and neither times "
-            "nor numbers in the names tell which belong together; give one pose for each image, in the images' order"
+            "nor numbers in the names show which belong together; give one pose for each image, in the images' order"
         )
     return {index: poses.matrices[at] for index, at in pairs.items()}
 
@@ -287,18 +283,11 @@ def _poses_of(images: Sequence[Path], poses: _Poses, root: Path) -> dict[int, Ar
 
 
 def _camera(root: Path, layout: _Layout, size: tuple[int, int]) -> tuple[Intrinsics, float | None, str]:
-    """The colour camera, stored depth values for each unit (None: not given), and the file that has them.
-
-    Raises:
-        InputError: no file has a camera.
-    """
-    candidates = []
-    for place in dict.fromkeys((layout.depth.parent, root, layout.colour)):
-        for pattern in ("*.yaml", "*.yml", "*.json", "*.txt", "*.cfg"):
-            candidates += [file for file in files_in(place, pattern) if file != layout.poses.file]
-    named = [file for file in candidates if _words(file.stem) & CAMERA_WORDS or file.suffix in (".yaml", ".yml")]
-    order = sorted(named, key=lambda file: (bool(_words(file.stem) & DEPTH_WORDS), natural_key(file.name)))
-    for file in order:
+    """The colour camera, stored depth values for each unit (None: not given), and the file that has them."""
+    places = dict.fromkeys((layout.depth.parent, root, layout.colour))
+    candidates = [file for place in places for pattern in CAMERA_FILES for file in files_in(place, pattern) if file != layout.poses.file]
+    named = [file for file in candidates if words_of(file.stem) & CAMERA_WORDS or file.suffix in (".yaml", ".yml")]
+    for file in sorted(named, key=lambda file: (bool(words_of(file.stem) & DEPTH_WORDS), natural_key(file.name))):
         values = _values(file)
         if values:
             camera = _intrinsics(values, size, str(file))
@@ -323,8 +312,8 @@ def _values(file: Path) -> dict[str, list[float]]:
     if words and all(NUMBER.fullmatch(word) for word in words):
         numbers = [float(word) for word in words]
         if len(numbers) in (9, 12, 16):
-            return {"matrix": np.array(numbers).reshape({9: (3, 3), 12: (3, 4), 16: (4, 4)}[len(numbers)])[:3, :3].ravel().tolist()}
-        return dict(zip(("fx", "fy", "cx", "cy"), ([value] for value in numbers), strict=True)) if len(numbers) == 4 else {}
+            return {"matrix": np.reshape(numbers, {9: (3, 3), 12: (3, 4), 16: (4, 4)}[len(numbers)])[:3, :3].ravel().tolist()}
+        return {name: [value] for name, value in zip(LENS, numbers, strict=True)} if len(numbers) == 4 else {}
     out: dict[str, list[float]] = {}
     for name, value in VALUE.findall(_without_nesting(text)):
         numbers = [float(number) for number in NUMBER.findall(value)]
@@ -335,8 +324,8 @@ def _values(file: Path) -> dict[str, list[float]]:
             matrix = np.array(out[key]).reshape(3, 3)
             out["matrix"] = (matrix.T if abs(matrix[2, 0]) > 1 else matrix).ravel().tolist()  # Open3D's is column by column
     if len(out.get("intrinsics", ())) == 4:
-        out.update({name: [value] for name, value in zip(("fx", "fy", "cx", "cy"), out["intrinsics"], strict=True)})
-    return out if "matrix" in out or all(name in out for name in ("fx", "fy", "cx", "cy")) else {}
+        out |= {name: [value] for name, value in zip(LENS, out["intrinsics"], strict=True)}
+    return out if "matrix" in out or all(name in out for name in LENS) else {}
 
 
 def _without_nesting(text: str) -> str:
@@ -349,15 +338,14 @@ def _without_nesting(text: str) -> str:
 def _intrinsics(values: dict[str, list[float]], size: tuple[int, int], where: str) -> Intrinsics:
     """The camera for images of `size`: as given, or scaled from the size that the file gives. Pixel centres are at whole numbers."""
     width, height = (
-        round(next((values[key][0] for key in keys if key in values), default))
+        next((values[key][0] for key in keys if key in values), default)
         for keys, default in zip((("width", "image_width", "w"), ("height", "image_height", "h")), size, strict=True)
     )
-    if not (0 < width < 10**6 and 0 < height < 10**6):
-        raise InputError(f"{where}: the image size {width}×{height} is not usable; correct it")
+    given = usable_size(width, height, where)
     if "matrix" in values:
-        camera = from_matrix(np.array(values["matrix"]).reshape(3, 3), width, height, where)
+        camera = from_matrix(np.array(values["matrix"]).reshape(3, 3), *given, where)
     else:
-        camera = sensor(width, height, *(values[name][0] for name in ("fx", "fy", "cx", "cy"))).checked(where)
+        camera = sensor(*given, *(values[name][0] for name in LENS)).checked(where)
     lens = [values.get(name, [0.0])[0] for name in ("k1", "k2", "p1", "p2", "k3")]
     if any(lens):
         camera = replace(camera, lens=OPENCV, distortion=tuple(lens)).checked(where)
@@ -366,22 +354,12 @@ def _intrinsics(values: dict[str, list[float]], size: tuple[int, int], where: st
 
 def _in_own_unit(capture: Capture) -> Capture:
     """With the unit of depth that nothing gives: of floating-point maps the poses' own, else millimetres if not another fits the poses."""
-    with_depth = [frame for frame in capture.frames if frame.depth is not None]
-    chosen = [with_depth[int(at)] for at in np.unique(np.linspace(0, len(with_depth) - 1, LOOKED_AT).round())] if with_depth else []
+    chosen = spread([frame for frame in capture.frames if frame.depth is not None], LOOKED_AT)
     raw = [(frame, load_depth(frame, capture)) for frame in chosen]
-    whole = all(np.array_equal(depth, np.round(depth)) for _, depth in raw)
-    scaled = replace(capture, depth_scale=MILLIMETRES if whole else 1.0)
-    samples = []
-    for frame, depth in raw:
-        camera = frame.depth_intrinsics or frame.intrinsics
-        if camera is not None and frame.world_from_camera is not None and depth.any():
-            camera = fitted(camera, (depth.shape[1], depth.shape[0]), str(frame.depth))
-            samples.append(Sample.of(depth / np.float32(scaled.depth_scale), camera, frame.world_from_camera))
-    factor = unit_factor(samples)
-    scale = scaled.depth_scale / factor
+    unit = MILLIMETRES if all(np.array_equal(depth, np.round(depth)) for _, depth in raw) else 1.0
+    samples = [Sample.of(depth / np.float32(unit), frame) for frame, depth in raw]
+    factor = unit_factor([sample for sample in samples if sample is not None])
+    scale = unit / factor
     how = "which fits the poses" if factor != 1 else "as is usual"
-    return replace(
-        scaled,
-        depth_scale=scale,
-        warnings=(*capture.warnings, f"no file gives the unit of depth; {scale:g} for each unit of the poses is taken, {how}"),
-    )
+    remark = f"no file gives the unit of depth; {scale:g} for each unit of the poses is taken, {how}"
+    return replace(capture, depth_scale=scale, warnings=(*capture.warnings, remark))

@@ -14,21 +14,27 @@ from pathlib import Path
 import numpy as np
 
 from fieldfuse.camera import Intrinsics
-from fieldfuse.capture.calibration import from_matrix, read_matrix_for, sensor
-from fieldfuse.capture.listing import assemble, counted, files_in, pictures_in, require_folder, same_count
+from fieldfuse.capture.calibration import fitted, from_matrix, read_matrix_for, sensor
+from fieldfuse.capture.headers import image_header
+from fieldfuse.capture.listing import assemble, counted, files_in, images_in, require_folder, same_count
 from fieldfuse.capture.poses import checked_pose
-from fieldfuse.capture.sens import SUFFIX, Sens, scan
-from fieldfuse.capture.sens_frames import sens_size
-from fieldfuse.capture.seven_scenes import FrameFiles, first_sizes, frame_files, frame_folders, frame_names, lost_frames, posed_frames
-from fieldfuse.capture.seven_scenes_cameras import INFO
-from fieldfuse.capture.sizes import fitted, picture_header
+from fieldfuse.capture.sens import SUFFIX, scan, sens_size
+from fieldfuse.capture.seven_scenes import (
+    INFO,
+    FrameFiles,
+    first_sizes,
+    frame_files,
+    frame_folders,
+    frame_names,
+    lost_frames,
+    posed_frames,
+)
 from fieldfuse.capture.types import Capture, Frame
 from fieldfuse.errors import InputError
 
 COLOUR_CAMERA = sensor(1296, 968, 1165.72, 1165.74, 647.5, 483.5)  # nominal centre
 DEPTH_CAMERA = sensor(640, 480, 577.87, 577.87, 319.5, 239.5)
 UP = (0.0, 0.0, 1.0)
-RATES = (1.0, 240.0)  # frames a second that a file's times can mean
 
 
 def looks_exported(path: Path) -> bool:
@@ -38,20 +44,20 @@ def looks_exported(path: Path) -> bool:
 
 def packed(path: Path) -> list[Path]:
     """The `.sens` files directly in a folder that holds no frames as files."""
-    return [] if looks_exported(path) or frame_folders(path) else pictures_in(path, (SUFFIX,))
+    return [] if looks_exported(path) or frame_folders(path) else images_in(path, (SUFFIX,))
 
 
 def looks_like_scannet(path: Path) -> bool:
     if looks_exported(path) or packed(path):
         return True
-    if (path / INFO).is_file():  # BundleFusion's, which brings its cameras
+    if (path / INFO).is_file():  # BundleFusion's, which has its cameras
         return False
     # A sample shares its file names with 7-Scenes; there colour and depth have one size, here they differ.
     for folder in frame_folders(path):
         for colour in sorted(folder.glob("frame-*.color.*")):
             depth = colour.with_name(f"{colour.name.split('.')[0]}.depth.png")
             if depth.is_file():
-                return picture_header(colour).size != picture_header(depth).size
+                return image_header(colour).size != image_header(depth).size
     return False
 
 
@@ -59,7 +65,7 @@ def read_scannet(path: Path | str) -> Capture:
     """RGB-D frames with poses in metres.
 
     Raises:
-        InputError: no frames, pictures and poses differ in number, a pose is NaN or not rigid, or a camera file is not usable.
+        InputError: no frames, images and poses differ in number, a pose is NaN or not rigid, or a camera file is not usable.
     """
     root = require_folder(path)
     inside = packed(root)
@@ -67,28 +73,20 @@ def read_scannet(path: Path | str) -> Capture:
         raise InputError(f"{root} holds {len(inside)} .sens files; give one of them, for instance {inside[0]}")
     if inside:
         return read_sens(inside[0])
-    found = _exported(root) if (root / "pose").is_dir() else frame_files(root)
-    names = frame_names(found) if not (root / "pose").is_dir() else [entry.stem for entry in found]
+    exported = (root / "pose").is_dir()
+    found = _exported(root) if exported else frame_files(root)
+    names = [entry.stem for entry in found] if exported else frame_names(found)
     colour_camera, depth_camera, warnings = _cameras(root, found)
     frames, remarks = posed_frames(found, names, colour_camera, depth_camera, root)
-    return assemble(
-        "scannet",
-        root,
-        frames,
-        [*warnings, *remarks],
-        ordered=True,
-        metric=True,
-        depth_scale=1000.0,
-        up=UP,
-        extra={"listed": len(found), "lost": len(found) - len(frames)},
-    )
+    extra = {"listed": len(found), "lost": len(found) - len(frames)}
+    return assemble("scannet", root, frames, [*warnings, *remarks], ordered=True, metric=True, up=UP, extra=extra)
 
 
 def read_sens(path: Path) -> Capture:
     """The frames of a `.sens` file that have a pose, still inside it (`Capture.filmed`); named by their number, as they are exported.
 
     Raises:
-        InputError: the file is not usable, all frames are lost, a pose or a camera in it is none, or its pictures have another shape.
+        InputError: the file is not usable, all frames are lost, a pose or a camera in it is none, or its images have another shape.
     """
     found = scan(path)
     colour, depth = (
@@ -97,9 +95,13 @@ def read_sens(path: Path) -> Capture:
     )
     seen = np.flatnonzero(found.places[:, 1])
     if not len(seen):
-        raise InputError(f"{path} holds no picture; copy it again from where it was published")
+        raise InputError(f"{path} holds no image; copy it again from where it was published")
     tracked = [int(index) for index in seen if np.isfinite(found.poses[index]).all()]
-    remarks = [*lost_frames(len(seen), len(tracked), path), *_unused(found)]
+    remarks = lost_frames(len(seen), len(tracked), path)
+    if len(seen) < len(found):
+        remarks.append(f"{counted(len(found) - len(seen), 'frame')} of {path.name} left out because no image belongs to it")
+    if np.abs(found.matrices[[1, 3]] - np.eye(4)).max() > 1e-6:
+        remarks.append(f"{path.name} has the offset between image and depth camera, which is not used: both are taken as one")
     colour = fitted(colour, sens_size(found, tracked[0]), f"{path}, frame {tracked[0]}")
     frames = [
         Frame(
@@ -113,50 +115,24 @@ def read_sens(path: Path) -> Capture:
         )
         for index in tracked
     ]
-    return assemble(
-        "scannet",
-        path.parent,
-        frames,
-        remarks,
-        ordered=True,
-        metric=True,
-        depth_scale=found.depth_scale,
-        up=UP,
-        extra={"listed": len(found), "lost": len(seen) - len(tracked), "fps": _rate(found)},
-    )
-
-
-def _unused(found: Sens) -> list[str]:
-    """What the file tells and nobody uses."""
-    remarks = []
-    blind = int((found.places[:, 1] == 0).sum())
-    if blind:
-        remarks.append(f"{counted(blind, 'frame')} of {found.path.name} left out because no picture belongs to it")
-    if np.abs(found.matrices[[1, 3]] - np.eye(4)).max() > 1e-6:
-        remarks.append(f"{found.path.name} tells how far picture and depth camera stand apart, which is not used: both are taken as one")
-    return remarks
-
-
-def _rate(found: Sens) -> float:
-    """Frames a second by their times, 0 where these tell none."""
-    seconds = (float(found.times[-1]) - float(found.times[0])) / 1e6 if len(found) > 1 else 0.0
+    seconds = (float(found.times[-1]) - float(found.times[0])) / 1e6
     rate = (len(found) - 1) / seconds if seconds > 0 else 0.0
-    return rate if RATES[0] <= rate <= RATES[1] else 0.0
+    extra = {"listed": len(found), "lost": len(seen) - len(tracked), "fps": rate if 1 <= rate <= 240 else 0.0}  # 0: unknown
+    facts = {"ordered": True, "metric": True, "depth_scale": found.depth_scale, "up": UP, "extra": extra}
+    return assemble("scannet", path.parent, frames, remarks, **facts)
 
 
 def _exported(root: Path) -> list[FrameFiles]:
-    colours = pictures_in(root / "color")
-    depths = {path.stem: path for path in pictures_in(root / "depth")}
+    colours = images_in(root / "color")
+    depths = {path.stem: path for path in images_in(root / "depth")}
     poses = {path.stem: path for path in files_in(root / "pose", "*.txt")}
     same_count(len(colours), len(poses), root)
-    found = []
     for colour in colours:
         if colour.stem not in poses:
-            raise InputError(f"{colour} has no pose {root / 'pose' / colour.stem}.txt; add it or remove the picture")
-        found.append(FrameFiles(colour.stem, colour, poses[colour.stem], depths.get(colour.stem)))
-    if not found:
-        raise InputError(f"{root / 'color'} holds no pictures; export the scan's colour pictures first")
-    return found
+            raise InputError(f"{colour} has no pose {root / 'pose' / colour.stem}.txt; add it or remove the image")
+    if not colours:
+        raise InputError(f"{root / 'color'} holds no images; export the scan's colour images first")
+    return [FrameFiles(colour.stem, colour, poses[colour.stem], depths.get(colour.stem)) for colour in colours]
 
 
 def _cameras(root: Path, found: list[FrameFiles]) -> tuple[Intrinsics, Intrinsics, list[str]]:
@@ -173,7 +149,7 @@ def _cameras(root: Path, found: list[FrameFiles]) -> tuple[Intrinsics, Intrinsic
             warnings.append(f"no {name} was found; the sensor's usual {'colour' if which == 'color' else 'depth'} camera is used")
             continue
         camera, scaled = read_matrix_for(file, size, (usual.width, usual.height))
-        if scaled:  # pictures were exported smaller than the sensor's
-            warnings.append(f"{file.name} is for {usual.width}×{usual.height} pictures; scaled to {size[0]}×{size[1]}")
+        if scaled:  # images were exported smaller than the sensor's
+            warnings.append(f"{file.name} is for {usual.width}×{usual.height} images; scaled to {size[0]}×{size[1]}")
         cameras.append(camera)
     return cameras[0], cameras[1], warnings

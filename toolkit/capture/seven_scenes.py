@@ -1,34 +1,66 @@
 """7-Scenes: `frame-000000.color.png`, `.depth.png`, `.pose.txt`, in the folder itself or in `seq-01/`, `seq-02/`, …
 
-`pose.txt` is world_from_camera in OpenCV axes, metres; depth in millimetres, 0 and 65535 mean missing. The set ships one focal
-length, 585, which fits its depth; its colour pictures are not registered to the depth and fit 525 (both are confirmed by
-reprojection in the tests). Other cameras: `seven_scenes_cameras`. Frames whose tracking was lost have a pose of -inf and are dropped.
+`pose.txt` is world_from_camera in OpenCV axes, metres; depth in millimetres, 0 and 65535 mean missing. Frames whose tracking was lost have
+a pose of -inf and are dropped.
+
+The cameras are in `camera-intrinsics.txt` or BundleFusion's `info.txt`. 7-Scenes has one focal length, 585, which fits its depth; its
+colour images are not registered to the depth and fit 525 (both are confirmed by reprojection in the tests). A file with that focal length
+is 7-Scenes' own and holds for the depth alone; another one is of somebody's own recording, where both images share it.
 """
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
 
 from fieldfuse.camera import Intrinsics
-from fieldfuse.capture.listing import assemble, counted, pictures_in, read_matrix, require_folder, same_count, unique_names
-from fieldfuse.capture.poses import checked_pose, single_frame
-from fieldfuse.capture.seven_scenes_cameras import read_cameras
-from fieldfuse.capture.sizes import first_size, fitted, picture_header
+from fieldfuse.capture.calibration import from_matrix, posed_frame, read_matrix_for, usable_size
+from fieldfuse.capture.headers import image_size
+from fieldfuse.capture.listing import (
+    assemble,
+    counted,
+    images_in,
+    numbers,
+    read_matrix,
+    read_text,
+    require_folder,
+    same_count,
+    unique_names,
+)
+from fieldfuse.capture.poses import single_frame
 from fieldfuse.capture.types import Capture, Frame
 from fieldfuse.errors import InputError
+
+USUAL = (640, 480)
+# Both are nominal: the principal point is the image's centre, so no half pixel is added.
+DEPTH_CAMERA = Intrinsics(*USUAL, 585.0, 585.0, 320.0, 240.0)
+COLOUR_CAMERA = Intrinsics(*USUAL, 525.0, 525.0, 320.0, 240.0)
+STOCK = 0.5  # pixels by which a file's numbers may differ from the set's own
+CAMERA_FILES = ("camera-intrinsics.txt", "camera_intrinsics.txt")
+INFO = "info.txt"  # BundleFusion's, lines of `name = values`
+MILLIMETRES = 1000.0
 
 
 @dataclass(frozen=True)
 class FrameFiles:
-    """One `frame-…`: its picture, its pose file and its depth when there is one."""
+    """One frame: its image, its pose file and its depth when there is one."""
 
     stem: str
     colour: Path
     pose: Path
     depth: Path | None
+
+
+@dataclass(frozen=True)
+class Cameras:
+    """Of one folder; images of other sizes get them scaled."""
+
+    colour: Intrinsics
+    depth: Intrinsics
+    depth_scale: float = MILLIMETRES  # stored values to the metre
+    warnings: tuple[str, ...] = ()
 
 
 def frame_folders(root: Path) -> list[Path]:
@@ -39,25 +71,21 @@ def frame_folders(root: Path) -> list[Path]:
 
 
 def frame_files(root: Path) -> list[FrameFiles]:
-    """All frames below `root`, in the order of their folders and numbers.
-
-    Raises:
-        InputError: no frames, or not one pose for each picture.
-    """
+    """All frames below `root`, in the order of their folders and numbers."""
     found: list[FrameFiles] = []
     for folder in frame_folders(root):
-        pictures = [path for path in pictures_in(folder) if path.name.startswith("frame-")]
-        colours = [path for path in pictures if path.stem.endswith(".color")]
-        depths = {path.name.split(".")[0]: path for path in pictures if path.stem.endswith(".depth")}
+        images = [path for path in images_in(folder) if path.name.startswith("frame-")]
+        colours = [path for path in images if path.stem.endswith(".color")]
+        depths = {path.name.split(".")[0]: path for path in images if path.stem.endswith(".depth")}
         poses = {path.name.split(".")[0]: path for path in folder.glob("frame-*.pose.txt")}
         same_count(len(colours), len(poses), folder)
         for colour in colours:
             stem = colour.name.split(".")[0]
             if stem not in poses:
-                raise InputError(f"{colour} has no pose file {stem}.pose.txt beside it; add it or remove the picture")
+                raise InputError(f"{colour} has no pose file {stem}.pose.txt beside it; add it or remove the image")
             found.append(FrameFiles(stem, colour, poses[stem], depths.get(stem)))
     if not found:
-        raise InputError(f"{root} holds no frame-*.color pictures; give the folder of one scene or one sequence")
+        raise InputError(f"{root} holds no frame-*.color images; give the folder of one scene or one sequence")
     return found
 
 
@@ -69,11 +97,7 @@ def frame_names(found: list[FrameFiles]) -> list[str]:
 def posed_frames(
     found: list[FrameFiles], names: list[str], colour: Intrinsics, depth: Intrinsics, root: Path
 ) -> tuple[list[Frame], list[str]]:
-    """The frames that have a pose, and a remark on those that were lost (-inf or NaN). The cameras are scaled to the pictures' sizes.
-
-    Raises:
-        InputError: all are lost, a pose is not rigid, or a picture has another shape than its camera.
-    """
+    """The frames that have a pose, and a remark on those that were lost (-inf or NaN). The cameras are scaled to the images' sizes."""
     frames = []
     lost = 0
     for entry, name in zip(found, names, strict=True):
@@ -82,25 +106,12 @@ def posed_frames(
             if not np.isfinite(pose).all():
                 lost += 1
                 continue
-            frames.append(
-                Frame(
-                    name=name,
-                    image=entry.colour,
-                    intrinsics=fitted(colour, picture_header(entry.colour).size, str(entry.colour)),
-                    world_from_camera=checked_pose(pose, str(entry.pose)),
-                    depth=entry.depth,
-                    depth_intrinsics=None if entry.depth is None else fitted(depth, picture_header(entry.depth).size, str(entry.depth)),
-                )
-            )
+            frames.append(posed_frame(name, entry.colour, colour, pose, str(entry.pose), entry.depth, depth_intrinsics=depth))
     return frames, lost_frames(len(found), len(found) - lost, root)
 
 
 def lost_frames(listed: int, tracked: int, where: Path) -> list[str]:
-    """A remark on frames whose tracking was lost, none where none was.
-
-    Raises:
-        InputError: all of them are.
-    """
+    """A remark on frames whose tracking was lost, none where none was."""
     lost = listed - tracked
     if not tracked:
         raise InputError(f"all {counted(lost, 'pose')} in {where} are -inf or NaN (tracking lost); no frame is left to use")
@@ -108,9 +119,9 @@ def lost_frames(listed: int, tracked: int, where: Path) -> list[str]:
 
 
 def first_sizes(found: list[FrameFiles]) -> tuple[tuple[int, int], tuple[int, int] | None]:
-    """Size (width, height) of the first picture that can be read, and of the first depth picture, if there is one."""
-    depths = [entry.depth for entry in found if entry.depth is not None]
-    return first_size([entry.colour for entry in found]), first_size(depths) if depths else None
+    """Size (width, height) of the first image that can be read, and of the first depth image, if there is one."""
+    colours, depths = [entry.colour for entry in found], [entry.depth for entry in found if entry.depth is not None]
+    return image_size(colours[0], colours), image_size(depths[0], depths) if depths else None
 
 
 def looks_like_seven_scenes(path: Path) -> bool:
@@ -125,6 +136,42 @@ def read_seven_scenes(path: Path | str) -> Capture:
     """
     root = require_folder(path)
     found = frame_files(root)
-    cameras = read_cameras(root, *first_sizes(found))
+    cameras = _cameras(root, *first_sizes(found))
     frames, remarks = posed_frames(found, frame_names(found), cameras.colour, cameras.depth, root)
     return assemble("7scenes", root, frames, [*cameras.warnings, *remarks], ordered=True, metric=True, depth_scale=cameras.depth_scale)
+
+
+def _cameras(root: Path, colour_size: tuple[int, int], depth_size: tuple[int, int] | None) -> Cameras:
+    """The cameras of the folder whose images have these sizes (width, height); `depth_size` None: there is no depth."""
+    file = next((path for name in CAMERA_FILES if (path := root / name).is_file()), None)
+    if file is not None:
+        given, _ = read_matrix_for(file, depth_size or colour_size, USUAL, shift=0.0)
+        there, here = ((one.fx, one.fy, one.cx, one.cy) for one in (DEPTH_CAMERA, given.scaled(*USUAL)))
+        return Cameras(COLOUR_CAMERA if np.abs(np.subtract(there, here)).max() <= STOCK else given, given)
+    info = root / INFO
+    lines = (line.partition("=") for line in read_text(info).splitlines()) if info.is_file() else ()
+    values = {name.strip(): words.split() for name, _, words in lines}
+    if "m_calibrationColorIntrinsic" not in values:
+        warning = (
+            f"no {CAMERA_FILES[0]} was found; the usual cameras of 7-Scenes are used "
+            f"({COLOUR_CAMERA.fx:g} pixels for colour, {DEPTH_CAMERA.fx:g} for depth)"
+        )
+        return Cameras(COLOUR_CAMERA, DEPTH_CAMERA, warnings=(warning,))
+    colour = _of_info(info, values, "Color", colour_size)
+    # Without a camera of its own depth is registered to the colour image.
+    depth = _of_info(info, values, "Depth", depth_size or USUAL) if "m_calibrationDepthIntrinsic" in values else colour
+    scale = float(numbers(values.get("m_depthShift", [MILLIMETRES]), f"{info}: 'm_depthShift'", 1)[0])
+    if not scale > 0:
+        raise InputError(f"{info}: 'm_depthShift' is {scale:g}, it must be positive; correct it")
+    return Cameras(colour, depth, scale)
+
+
+def _of_info(path: Path, values: dict[str, list[str]], which: str, size: tuple[int, int]) -> Intrinsics:
+    keys = [f"m_{which.lower()}{side}" for side in ("Width", "Height")]
+    width, height = (numbers(values.get(key, [side]), f"{path}: {key!r}", 1)[0] for key, side in zip(keys, size, strict=True))
+    where = f"{path}: 'm_calibration{which}Intrinsic'"
+    matrix = numbers(values[f"m_calibration{which}Intrinsic"], where, 16).reshape(4, 4)
+    camera = from_matrix(matrix, *usable_size(width, height, str(path)), where, shift=0.0)
+    if (camera.cx, camera.cy) != (camera.width / 2, camera.height / 2):  # calibrated, not nominal: pixel centres at whole numbers
+        camera = replace(camera, cx=camera.cx + 0.5, cy=camera.cy + 0.5)
+    return camera.centred(where)

@@ -1,17 +1,32 @@
-"""A capture as plain JSON data and back, so that a run's folder can keep it (`capture.json`)."""
+"""What a run's folder holds of a capture: `capture.json` (the capture as plain data) and prepared `Views` as one safetensors file."""
 
 from __future__ import annotations
 
+import json
+import math
+from dataclasses import fields
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+from safetensors import SafetensorError, safe_open
+from safetensors.numpy import save_file
 
-from fieldfuse.camera import Array, Intrinsics
-from fieldfuse.capture.types import Capture, Frame
+from fieldfuse.camera import PINHOLE, Array, Intrinsics
+from fieldfuse.capture.types import Capture, Frame, Views
 from fieldfuse.errors import InputError, first_line
+from fieldfuse.files import atomic_path
+from fieldfuse.tone import Tone
 
 VERSION = 1
+PATHS, CAMERAS, POSES = ("image", "depth", "mask", "confidence"), ("intrinsics", "depth_intrinsics"), ("world_from_camera", "depth_pose")
+FLAGS = ("mask_excludes", "mask_is_alpha", "as_stored")
+OPTIONAL: tuple[tuple[str, str, type, tuple[int, ...]], ...] = (  # lists of `Views`, and the name, type and channels in the file
+    ("valid", "valid", np.bool_, ()),
+    ("alpha", "alpha", np.uint8, ()),
+    ("depths", "depth", np.float32, ()),
+    ("photos", "photo", np.uint8, (3,)),
+)
 
 
 def capture_to_dict(capture: Capture) -> dict[str, Any]:
@@ -29,7 +44,7 @@ def capture_to_dict(capture: Capture) -> dict[str, Any]:
         "extra": capture.extra,
         "film": capture.film,
         "points": None if capture.points is None else np.asarray(capture.points, dtype=np.float64).tolist(),
-        "frames": [_frame_to_dict(frame) for frame in capture.frames],
+        "frames": [{one.name: _plain(getattr(frame, one.name)) for one in fields(frame)} for frame in capture.frames],
     }
 
 
@@ -47,7 +62,7 @@ def capture_from_dict(data: dict[str, Any]) -> Capture:
         return Capture(
             kind=str(data["kind"]),
             root=Path(data["root"]),
-            frames=tuple(_frame_from_dict(frame) for frame in data["frames"]),
+            frames=tuple(_frame(frame) for frame in data["frames"]),
             ordered=bool(data["ordered"]),
             metric=bool(data["metric"]),
             depth_scale=float(data["depth_scale"]),
@@ -64,51 +79,108 @@ def capture_from_dict(data: dict[str, Any]) -> Capture:
         ) from error
 
 
-def _frame_to_dict(frame: Frame) -> dict[str, Any]:
-    return {
-        "name": frame.name,
-        "image": str(frame.image),
-        "intrinsics": None if frame.intrinsics is None else frame.intrinsics.to_dict(),
-        "world_from_camera": None if frame.world_from_camera is None else np.asarray(frame.world_from_camera, dtype=np.float64).tolist(),
-        "depth": None if frame.depth is None else str(frame.depth),
-        "depth_intrinsics": None if frame.depth_intrinsics is None else frame.depth_intrinsics.to_dict(),
-        "mask": None if frame.mask is None else str(frame.mask),
-        "mask_excludes": frame.mask_excludes,
-        "mask_is_alpha": frame.mask_is_alpha,
-        "split": frame.split,
-        "video_index": frame.video_index,
-        "focal_prior": frame.focal_prior,
-        "as_stored": frame.as_stored,
-        "white": frame.white,
-        "confidence": None if frame.confidence is None else str(frame.confidence),
-        "depth_pose": None if frame.depth_pose is None else np.asarray(frame.depth_pose, dtype=np.float64).tolist(),
+def _plain(value: Any) -> Any:
+    if isinstance(value, Path):
+        return str(value)
+    if isinstance(value, Intrinsics):
+        return value.to_dict()
+    return np.asarray(value, dtype=np.float64).tolist() if isinstance(value, np.ndarray) else value
+
+
+def _frame(data: dict[str, Any]) -> Frame:
+    given = {key: value for key, value in data.items() if value is not None}
+    values: dict[str, Any] = {key: given.get(key) for key in ("split", "video_index", "focal_prior")}
+    values |= {key: Path(given[key]) for key in PATHS if key in given}
+    values |= {key: Intrinsics.from_dict(given[key]).checked("the stored capture") for key in CAMERAS if key in given}
+    values |= {key: np.array(given[key], dtype=np.float64).reshape(4, 4) for key in POSES if key in given}
+    values |= {key: bool(given.get(key, False)) for key in FLAGS}
+    return Frame(name=str(data["name"]), white=int(given["white"]) if "white" in given else None, **values)
+
+
+# ------------------------------------------------------------------------------------------------ views
+
+
+def save_views(path: Path, views: Views) -> None:
+    """Write `views` atomically: pixels as tensors, names and cameras as JSON in the file's metadata.
+
+    Raises:
+        OutputError: the folder is not writable or the disk is full.
+    """
+    tensors: dict[str, Array] = {
+        "world_from_camera": np.ascontiguousarray(views.world_from_camera, dtype=np.float64),
+        "test": np.ascontiguousarray(views.test, dtype=np.bool_),
     }
+    for index in range(len(views)):
+        tensors[f"image.{index}"] = np.ascontiguousarray(views.images[index], dtype=np.uint8)
+        for attribute, name, kind, _ in OPTIONAL:
+            values = getattr(views, attribute)
+            if values and values[index] is not None:
+                tensors[f"{name}.{index}"] = np.ascontiguousarray(values[index], dtype=kind)
+    facts = {
+        "names": views.names,
+        "intrinsics": [intrinsics.to_dict() for intrinsics in views.intrinsics],
+        "background": views.background,
+        "weight": views.weight,
+        "tones": [None if tone is None else tone.to_dict() for tone in views.tones],
+    }
+    metadata = {"format": "fieldfuse-views", "version": str(VERSION), "views": json.dumps(facts, allow_nan=False)}
+    with atomic_path(path) as temporary:
+        save_file(tensors, temporary, metadata=metadata)
 
 
-def _frame_from_dict(data: dict[str, Any]) -> Frame:
-    return Frame(
-        name=str(data["name"]),
-        image=Path(data["image"]),
-        intrinsics=_intrinsics(data["intrinsics"]),
-        world_from_camera=_pose(data["world_from_camera"]),
-        depth=None if data["depth"] is None else Path(data["depth"]),
-        depth_intrinsics=_intrinsics(data["depth_intrinsics"]),
-        mask=None if data["mask"] is None else Path(data["mask"]),
-        mask_excludes=bool(data.get("mask_excludes", False)),
-        mask_is_alpha=bool(data.get("mask_is_alpha", False)),
-        split=data["split"],
-        video_index=data["video_index"],
-        focal_prior=data["focal_prior"],
-        as_stored=bool(data.get("as_stored", False)),
-        confidence=None if data.get("confidence") is None else Path(data["confidence"]),
-        white=None if data.get("white") is None else int(data["white"]),
-        depth_pose=_pose(data.get("depth_pose")),
-    )
+def load_views(path: Path) -> Views:
+    """Read views back, checking that every part has the size that the others promise.
+
+    Raises:
+        InputError: missing, of another kind or version, damaged or tampered with.
+    """
+    path = Path(path)
+    if not path.is_file():
+        raise InputError(f"there are no prepared views {path}; run the job again to make them")
+    try:
+        with safe_open(path, framework="numpy") as file:
+            metadata = file.metadata() or {}
+            if metadata.get("format") == "fieldfuse-views" and metadata.get("version") == str(VERSION):
+                return _views(json.loads(metadata["views"]), set(file.keys()), file)
+    except (InputError, SafetensorError, OSError, KeyError, TypeError, ValueError, AttributeError, RecursionError) as error:
+        raise InputError(f"the prepared views {path} are damaged ({first_line(error)}); remove the file and run the job again") from error
+    raise InputError(f"{path} does not hold prepared views of version {VERSION}; remove it and run the job again")
 
 
-def _intrinsics(data: dict[str, Any] | None) -> Intrinsics | None:
-    return None if data is None else Intrinsics.from_dict(data).checked("the stored capture")
+def _views(facts: dict[str, Any], keys: set[str], file: Any) -> Views:
+    def require(fine: bool, reason: str) -> None:
+        if not fine:
+            raise ValueError(reason)
 
+    def tensor(key: str, kind: type, shape: tuple[int, ...]) -> Array:
+        value = np.asarray(file.get_tensor(key))
+        require(value.dtype == kind and value.shape == shape, f"{key} is {value.dtype} {value.shape}, expected {np.dtype(kind)} {shape}")
+        return value
 
-def _pose(data: Any) -> Array | None:
-    return None if data is None else np.array(data, dtype=np.float64).reshape(4, 4)
+    names = [str(name) for name in facts["names"]]
+    cameras = [Intrinsics.from_dict(entry).checked(f"camera {index}") for index, entry in enumerate(facts["intrinsics"])]
+    count = len(names)
+    require(len(cameras) == count, f"{count} names and {len(cameras)} cameras")
+    require(len(set(names)) == count, "a name stands for two views")
+    poses = tensor("world_from_camera", np.float64, (count, 4, 4))
+    require(bool(np.isfinite(poses).all()), "a pose is not finite")
+    views = Views(names, [], cameras, poses, tensor("test", np.bool_, (count,)))
+    for index, camera in enumerate(cameras):
+        require(camera.lens == PINHOLE and not camera.distorted, f"camera {index} has a lens")
+        size = camera.height, camera.width
+        views.images.append(tensor(f"image.{index}", np.uint8, (*size, 3)))
+        for attribute, name, kind, channels in OPTIONAL:
+            key = f"{name}.{index}"
+            getattr(views, attribute).append(tensor(key, kind, (*size, *channels)) if key in keys else None)
+    if facts["background"] is not None:
+        red, green, blue = (float(value) for value in facts["background"])
+        require(all(math.isfinite(value) and 0 <= value <= 1 for value in (red, green, blue)), "the background is no colour")
+        views.background = (red, green, blue)
+    views.weight = [float(value) for value in facts.get("weight", [])]
+    views.tones = [None if entry is None else Tone.from_dict(entry) for entry in facts.get("tones", [])]
+    require(len(views.tones) in (0, count), "an image's tone is missing")
+    if all(photo is None for photo in views.photos):
+        views.photos = []
+    require(bool(views.tones) or not views.photos, "there are photos in other colours, and their tones are missing")
+    require(len(views.weight) in (0, count) and all(0 <= value <= 1 for value in views.weight), "a weight is no share, or one is missing")
+    return views

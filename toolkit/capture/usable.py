@@ -1,4 +1,4 @@
-"""One bad part does not stop a good whole: frames that cannot be used are left out where nearly all others can."""
+"""One bad part does not stop a good whole: frames that cannot be used are excluded where nearly all others can."""
 
 from __future__ import annotations
 
@@ -7,18 +7,17 @@ from dataclasses import replace
 
 import numpy as np
 
-from fieldfuse.capture.headers import orientation_of, read_bytes, read_header
+from fieldfuse.capture.archive import read_bytes
+from fieldfuse.capture.headers import LYING, image_header, orientation_of, read_header
 from fieldfuse.capture.images import EXIF_TURNS
-from fieldfuse.capture.listing import PICTURES, counted
+from fieldfuse.capture.listing import IMAGES, counted, some_of
 from fieldfuse.capture.poses import PoseNotes
-from fieldfuse.capture.sizes import LYING, picture_header
 from fieldfuse.capture.types import Capture
 from fieldfuse.errors import InputError
 
-MOST_BAD = 0.2  # share of the frames that may be left out; with more of them something is wrong with the capture
+MOST_BAD = 0.2  # share of the frames that may be excluded; with more of them something is wrong with the capture
 MIN_FRAMES = 3  # frames that have to stay
 BESIDE = ("transforms", "blender", "colmap", "llff")  # kinds whose images may be photos as a camera wrote them
-NAMED = 3  # frames that a remark names
 
 
 def without(capture: Capture, bad: Mapping[str, str], refusal: str | None = None) -> Capture:
@@ -26,63 +25,54 @@ def without(capture: Capture, bad: Mapping[str, str], refusal: str | None = None
     not read at all may be among the bad ones.
 
     Args:
-        refusal: what is said where too many are bad; None: the first one's sentence.
-
-    Raises:
-        InputError: too many are bad.
+        refusal: the error where too many are bad; None: the first one's sentence.
     """
     if not bad:
         return capture
-    kept = [frame for frame in capture.frames if frame.name not in bad]
-    lost = len(bad)
-    total = len(kept) + lost
+    stay = [frame for frame in capture.frames if frame.name not in bad]
+    lost, total = len(bad), len(stay) + len(bad)
     first = next(iter(bad.values()))
-    if lost > MOST_BAD * total or len(kept) < MIN_FRAMES:
+    if lost > MOST_BAD * total or len(stay) < MIN_FRAMES:
         raise InputError(refusal or (f"{first} ({lost} of {total} frames are like this)" if lost > 1 else first))
-    names = ", ".join(list(bad)[:NAMED]) + (", …" if lost > NAMED else "")
     cause = first.rsplit("; ", 1)[0]
-    remark = f"{counted(lost, 'frame')} of {total} {'is' if lost == 1 else 'are'} left out ({names}): {cause}"
-    return capture.with_frames(kept, remark)
+    remark = f"{counted(lost, 'frame')} of {total} {'is' if lost == 1 else 'are'} left out ({some_of(list(bad))}): {cause}"
+    return capture.with_frames(stay, remark)
 
 
 def with_usable_depth(capture: Capture) -> Capture:
-    """The capture without those few depth maps that are missing, empty or damaged; their frames stay.
-
-    Raises:
-        InputError: too many depth maps are.
-    """
-    deep = [frame for frame in capture.frames if frame.depth is not None and frame.video_index is None]
-    bad: dict[str, str] = {}
-    for frame in deep:
-        assert frame.depth is not None
+    """The capture without those few depth maps that are missing, empty or damaged; their frames stay."""
+    total, bad = 0, dict[str, str]()
+    for frame in capture.frames:
+        if frame.depth is None or frame.video_index is not None:
+            continue
+        total += 1
         try:
-            if frame.depth.suffix.lower() in PICTURES:
+            if frame.depth.suffix.lower() in IMAGES:
                 read_header(read_bytes(frame.depth), frame.depth)
             elif not frame.depth.stat().st_size:
                 raise InputError(f"{frame.depth} is empty; copy it again")
-        except (InputError, OSError) as error:
-            bad[frame.name] = str(error) if isinstance(error, InputError) else f"{frame.depth} is not there; add it or remove the frame"
+        except InputError as error:
+            bad[frame.name] = str(error)
+        except OSError:
+            bad[frame.name] = f"{frame.depth} is not there; add it or remove the frame"
     if not bad:
         return capture
     first = next(iter(bad.values()))
-    if len(bad) > MOST_BAD * len(deep):
-        raise InputError(f"{first} ({len(bad)} of {len(deep)} depth maps are like this)" if len(bad) > 1 else first)
-    frames = [
-        replace(frame, depth=None, depth_intrinsics=None, confidence=None, depth_pose=None) if frame.name in bad else frame
-        for frame in capture.frames
-    ]
-    names = ", ".join(list(bad)[:NAMED]) + (", …" if len(bad) > NAMED else "")
-    return capture.with_frames(frames, f"{counted(len(bad), 'frame is', 'frames are')} used without depth ({names}): {first}")
+    if len(bad) > MOST_BAD * total:
+        raise InputError(f"{first} ({len(bad)} of {total} depth maps are like this)" if len(bad) > 1 else first)
+    none = {"depth": None, "depth_intrinsics": None, "confidence": None, "depth_pose": None}
+    frames = [replace(frame, **none) if frame.name in bad else frame for frame in capture.frames]
+    return capture.with_frames(frames, f"{counted(len(bad), 'frame is', 'frames are')} used without depth ({some_of(list(bad))}): {first}")
 
 
 def turned_by_exif(capture: Capture) -> Capture:
     """The capture with the switch that has its images turned by EXIF, where its cameras have the shape of the upright images only; and with
-    a remark on images that EXIF turns by 180° or mirrors, where the shape says nothing."""
+    a remark on images that EXIF turns by 180° or mirrors, where the shape shows nothing."""
     if capture.kind not in BESIDE or not capture.posed or any(frame.video_index is not None for frame in capture.frames):
         return capture
     turns = [orientation_of(frame.image) for frame in capture.frames]
     lying = sum(
-        turn >= LYING and (frame.intrinsics.width, frame.intrinsics.height) == picture_header(frame.image).size[::-1]
+        turn >= LYING and (frame.intrinsics.width, frame.intrinsics.height) == image_header(frame.image).size[::-1]
         for frame, turn in zip(capture.frames, turns, strict=True)
         if frame.intrinsics is not None and frame.intrinsics.width != frame.intrinsics.height
     )
@@ -100,11 +90,7 @@ def turned_by_exif(capture: Capture) -> Capture:
 
 
 def with_usable_poses(capture: Capture, notes: PoseNotes) -> Capture:
-    """The capture without frames whose pose holds nothing usable, and with remarks on poses that were made rigid.
-
-    Raises:
-        InputError: too many poses are unusable.
-    """
+    """The capture without frames whose pose holds nothing usable, and with remarks on poses that were made rigid."""
     lost = [frame for frame in capture.frames if frame.world_from_camera is not None and not np.isfinite(frame.world_from_camera).all()]
     sentences = [*notes.unusable[: len(lost)], *[""] * (len(lost) - len(notes.unusable))]
     refusal = None
@@ -116,9 +102,8 @@ def with_usable_poses(capture: Capture, notes: PoseNotes) -> Capture:
     if notes.scales:
         low, high = min(notes.scales), max(notes.scales)
         by = f"{low:.4g}" if high - low < 0.01 * high else f"{low:.4g} to {high:.4g}"
-        remarks.append(f"the rotations of {counted(len(notes.scales), 'pose')} were scaled by {by}, which was taken out")
+        remarks.append(f"the rotations of {counted(len(notes.scales), 'pose')} were scaled by {by}, which was removed")
     if notes.rounding:
-        most = max(notes.rounding)
-        many = counted(len(notes.rounding), "pose")
+        most, many = max(notes.rounding), counted(len(notes.rounding), "pose")
         remarks.append(f"the rotations of {many} were off by up to {most:.2g} (rounded?) and were made rigid")
     return capture.with_frames(capture.frames, *remarks) if remarks else capture

@@ -17,28 +17,27 @@ import cv2
 import numpy as np
 
 from fieldfuse.camera import Array
-from fieldfuse.capture.sens import is_sens
-from fieldfuse.capture.sens_frames import iterate_sens
+from fieldfuse.capture.headers import end_of_boxes
+from fieldfuse.capture.sens import is_sens, iterate_sens
 from fieldfuse.capture.types import Capture, Frame
 from fieldfuse.errors import InputError
 from fieldfuse.files import require_utf8
 
 VIDEO_SUFFIXES = (".mp4", ".mov", ".m4v", ".avi", ".mkv", ".webm", ".mpg", ".mpeg", ".3gp", ".mts", ".wmv")
-UNCOUNTED = (".mkv", ".webm")  # they do not say how many frames they have: what is announced is their length times their rate
+UNCOUNTED = (".mkv", ".webm")  # their headers have no number of frames: what is announced is their length times their rate
 SQUARE = 0.01  # difference of a pixel's sides that is nothing
 MOST_FRAMES = 2_000_000  # eighteen hours at 30 a second
 SMALLEST_FRAME = 8  # bytes
 OPENING = threading.Lock()  # one video is opened at a time: what OpenCV reads of the environment then is the whole process's
 _OPTIONS, _EVERY_FRAME = "OPENCV_FFMPEG_CAPTURE_OPTIONS", "ignore_editlist;1"
-_PLAYLISTS = (b"#EXTM3U", b"ffconcat")  # text that makes FFmpeg open other files or addresses
 
 
 def read_video(path: Path, *, as_stored: bool = False) -> Capture:
     """Describe a video: one `Frame` for each frame it announces, cameras and poses unknown.
 
     Only the header and the first frame are decoded; the announced number of frames is not a promise, `iterate_video` yields
-    what can really be read. Frames are upright: rotation metadata is applied by the decoder, and `extra["rotation"]` only tells
-    what it was. `extra` also has `fps`, `width`, `height` (upright) and `seconds`.
+    what can really be read. Frames are upright: rotation metadata is applied by the decoder, and is in `extra["rotation"]` for
+    information. `extra` also has `fps`, `width`, `height` (upright) and `seconds`.
 
     `as_stored` is for videos whose frames were noted down one by one while they were taken: frames are then as they were written, not
     turned, and those count too that the file's edit list hides from a player.
@@ -58,12 +57,22 @@ def read_video(path: Path, *, as_stored: bool = False) -> Capture:
         announced = stream.get(cv2.CAP_PROP_FRAME_COUNT)
         fps = stream.get(cv2.CAP_PROP_FPS)
         rotation = stream.get(cv2.CAP_PROP_ORIENTATION_META)
-        pixel = stream.get(cv2.CAP_PROP_SAR_NUM), stream.get(cv2.CAP_PROP_SAR_DEN)
+        across, down = stream.get(cv2.CAP_PROP_SAR_NUM), stream.get(cv2.CAP_PROP_SAR_DEN)
         # A header may announce anything; what a file of this size cannot hold, or nobody would film, is counted instead.
-        believable = min(path.stat().st_size // SMALLEST_FRAME, MOST_FRAMES)
-        count = int(announced) if math.isfinite(announced) and 0 < announced <= believable else _count(stream) + 1
+        if math.isfinite(announced) and 0 < announced <= min(path.stat().st_size // SMALLEST_FRAME, MOST_FRAMES):
+            count = int(announced)
+        else:
+            count = 1
+            while stream.grab():
+                count += 1
     finally:
         stream.release()
+    warnings = []
+    if across > 0 and down > 0 and abs(across / down - 1) > SQUARE:
+        warnings.append(
+            f"the pixels of the video {path.name} are not square ({across:g}:{down:g}) and are taken as if they were, so that all is "
+            f"stretched; make them square first: ffmpeg -i {path.name} -vf scale=iw*sar:ih,setsar=1 new.mp4"
+        )
     fps = float(fps) if math.isfinite(fps) and 0 < fps < 1e4 else 0.0
     frames = tuple(Frame(name=f"frame_{index:06d}", image=path, video_index=index, as_stored=as_stored) for index in range(count))
     extra = {
@@ -73,27 +82,14 @@ def read_video(path: Path, *, as_stored: bool = False) -> Capture:
         "height": int(first.shape[0]),
         "seconds": count / fps if fps else None,
     }
-    return Capture(kind="video", root=path.parent, frames=frames, ordered=True, extra=extra, warnings=_stretched(path, *pixel))
-
-
-def _stretched(path: Path, across: float, down: float) -> tuple[str, ...]:
-    """What to say of pixels that are `across` to `down` wide to high (0: not told)."""
-    if not (across > 0 and down > 0 and abs(across / down - 1) > SQUARE):
-        return ()
-    return (
-        f"the pixels of the video {path.name} are not square ({across:g}:{down:g}) and are taken as if they were, so that all comes out "
-        f"stretched; make them square first: ffmpeg -i {path.name} -vf scale=iw*sar:ih,setsar=1 new.mp4",
-    )
+    return Capture(kind="video", root=path.parent, frames=frames, ordered=True, extra=extra, warnings=tuple(warnings))
 
 
 def iterate_video(path: Path, indices: Collection[int] | None = None, *, as_stored: bool = False) -> Iterator[tuple[int, Array]]:
-    """Decode a video from its start and yield (index, picture), picture (H, W, 3) uint8 RGB, upright (or `as_stored`, see `read_video`).
+    """Decode a video from its start and yield (index, image), image (H, W, 3) uint8 RGB, upright (or `as_stored`, see `read_video`).
 
-    Frames are counted in decoding order rather than sought by time, so an index always means the same picture. With `indices`
+    Frames are counted in decoding order rather than sought by time, so an index always means the same image. With `indices`
     only those are converted and yielded, and decoding ends after the last of them. A `.sens` file is a video too.
-
-    Raises:
-        InputError: the video cannot be opened.
     """
     if is_sens(Path(path)):
         yield from iterate_sens(Path(path), indices)
@@ -105,25 +101,20 @@ def iterate_video(path: Path, indices: Collection[int] | None = None, *, as_stor
         index = 0
         while (wanted is None or index <= last) and stream.grab():
             if wanted is None or index in wanted:
-                ok, picture = stream.retrieve()
-                if not ok or picture is None:
+                ok, image = stream.retrieve()
+                if not ok or image is None:
                     break
-                yield index, to_rgb(picture)
+                channels = 1 if image.ndim == 2 else image.shape[2]
+                code = {1: cv2.COLOR_GRAY2RGB, 4: cv2.COLOR_BGRA2RGB}.get(channels, cv2.COLOR_BGR2RGB)
+                yield index, np.asarray(cv2.cvtColor(image, code))
             index += 1
     finally:
         stream.release()
 
 
-def to_rgb(picture: Array) -> Array:
-    """A decoder's (H, W), (H, W, 3) BGR or (H, W, 4) BGRA uint8 → (H, W, 3) RGB uint8."""
-    if picture.ndim == 2:
-        return np.asarray(cv2.cvtColor(picture, cv2.COLOR_GRAY2RGB))
-    return np.asarray(cv2.cvtColor(picture, cv2.COLOR_BGRA2RGB if picture.shape[2] == 4 else cv2.COLOR_BGR2RGB))
-
-
 def _open(path: Path, as_stored: bool = False) -> cv2.VideoCapture:
     require_utf8(path)  # OpenCV would end the process
-    # FFmpeg only: other backends would take a single picture, or a name with "%03d", for a video.
+    # FFmpeg only: other backends would take a single image, or a name with "%03d", for a video.
     with OPENING, _options(as_stored):
         level = cv2.utils.logging.getLogLevel()
         cv2.utils.logging.setLogLevel(cv2.utils.logging.LOG_LEVEL_SILENT)
@@ -143,33 +134,24 @@ def _open(path: Path, as_stored: bool = False) -> cv2.VideoCapture:
 
 @contextmanager
 def _options(every_frame: bool) -> Iterator[None]:
-    """What OpenCV tells FFmpeg while a video is opened: it takes this from the environment only. Other options there stay."""
+    """FFmpeg's options while a video is opened, which OpenCV takes from the environment only. Other options there stay."""
     before = os.environ.get(_OPTIONS)
-    if not every_frame:
-        yield
-        return
-    os.environ[_OPTIONS] = f"{before}|{_EVERY_FRAME}" if before else _EVERY_FRAME
+    if every_frame:
+        os.environ[_OPTIONS] = f"{before}|{_EVERY_FRAME}" if before else _EVERY_FRAME
     try:
         yield
     finally:
-        if before is None:
+        if every_frame and before is None:
             del os.environ[_OPTIONS]
-        else:
+        elif every_frame and before is not None:
             os.environ[_OPTIONS] = before
-
-
-def _count(stream: cv2.VideoCapture) -> int:
-    count = 0
-    while stream.grab():
-        count += 1
-    return count
 
 
 # --------------------------------------------------------------------------------------------- is the file whole
 
 
 def _check_container(path: Path) -> None:
-    """Refuse what is no file, empty, a playlist, or shorter than its container says.
+    """Refuse what is no file, empty, a playlist, or shorter than its container announces.
 
     A cut-off video often opens, announces all its frames and stops half-way, so the sizes in the container are compared with
     the file's: the boxes of mp4 and mov, the RIFF header of avi, the segment of Matroska.
@@ -179,46 +161,24 @@ def _check_container(path: Path) -> None:
     size = path.stat().st_size
     if size == 0:
         raise InputError(f"the video {path} is empty (0 bytes); copy it again from the camera")
+    expected = None
     try:
         with path.open("rb") as file:
             head = file.read(16)
-            if head.startswith(_PLAYLISTS):
+            if head.startswith((b"#EXTM3U", b"ffconcat")):  # text that makes FFmpeg open other files or addresses
                 raise InputError(f"{path} is a playlist, not a video; give the video file itself")
-            expected = _expected_size(file, head, size)
+            if head[4:8] in (b"ftyp", b"moov", b"mdat", b"wide", b"free", b"skip", b"pnot"):
+                expected = end_of_boxes(file, size)
+            elif head[:4] == b"RIFF" and head[8:12] == b"AVI ":
+                expected = 8 + int.from_bytes(head[4:8], "little")
+            elif head[:4] == b"\x1a\x45\xdf\xa3":
+                expected = _end_of_matroska(file)
     except OSError as error:
         raise InputError(f"cannot read the video {path}: {error.strerror or error}") from error
     if expected is not None and expected > size:
         raise InputError(
             f"the video {path} is cut short (it has {size} bytes and announces at least {expected}); copy it again from the camera"
         )
-
-
-def _expected_size(file: BinaryIO, head: bytes, size: int) -> int | None:
-    """Bytes that the container says the file has, None when it does not say or is of another kind."""
-    if head[4:8] in (b"ftyp", b"moov", b"mdat", b"wide", b"free", b"skip", b"pnot"):
-        return _end_of_boxes(file, size)
-    if head[:4] == b"RIFF" and head[8:12] == b"AVI ":
-        return 8 + int.from_bytes(head[4:8], "little")
-    if head[:4] == b"\x1a\x45\xdf\xa3":
-        return _end_of_matroska(file)
-    return None
-
-
-def _end_of_boxes(file: BinaryIO, size: int) -> int | None:
-    """Where the last box of an ISO base media file ends (ISO/IEC 14496-12, 4.2): 32-bit size, type, 64-bit size when it is 1."""
-    position = 0
-    while position + 8 <= size:
-        file.seek(position)
-        header = file.read(16)
-        length = int.from_bytes(header[:4], "big")
-        if length == 1 and len(header) == 16:
-            length = int.from_bytes(header[8:16], "big")
-        if length == 0:  # "to the end of the file"
-            return None
-        if length < 8 or not header[4:8].isascii():  # padding or junk behind the last box
-            return None
-        position += length
-    return position
 
 
 def _end_of_matroska(file: BinaryIO) -> int | None:

@@ -17,8 +17,8 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from fieldfuse.camera import Array, Intrinsics, distort, invert
+from fieldfuse.capture.calibration import fitted
 from fieldfuse.capture.images import load_depth
-from fieldfuse.capture.sizes import fitted
 from fieldfuse.capture.types import Capture
 from fieldfuse.effects import geometry
 from fieldfuse.effects.adjust import Problem, adjust, predict, residuals, uncertainty

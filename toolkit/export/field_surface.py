@@ -55,7 +55,7 @@ class Originals:
     def at(self, indices: Array, shown: Views, side: int) -> tuple[list[Intrinsics], Iterable[Array]]:
         """Cameras and images of the frames `indices`, which are the views `shown`: as large as they were taken, up to `side` pixels along
         the long side, corrected as those of the fit, and read one at a time; those of the fit where the originals are no larger."""
-        from fieldfuse.capture.prepare import pictures_at, target_size
+        from fieldfuse.capture.prepare import images_at, target_size
 
         lenses = []
         for index, small in zip(indices, shown.intrinsics, strict=True):
@@ -68,7 +68,7 @@ class Originals:
         def read() -> Iterator[Array]:
             import cv2
 
-            for lens, name, (_, image) in zip(lenses, shown.names, pictures_at(self.posed, indices, side), strict=True):
+            for lens, name, (_, image) in zip(lenses, shown.names, images_at(self.posed, indices, side), strict=True):
                 if image.shape[:2] != (lens.height, lens.width):
                     image = cv2.resize(image, (lens.width, lens.height), interpolation=cv2.INTER_AREA)
                 tone = None if self.corrections is None else self.corrections.tone(name)

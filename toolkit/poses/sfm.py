@@ -12,7 +12,8 @@ import numpy as np
 
 from fieldfuse import errors, memory
 from fieldfuse.camera import Intrinsics
-from fieldfuse.capture.headers import read_bytes, read_header
+from fieldfuse.capture.archive import read_bytes
+from fieldfuse.capture.headers import read_header
 from fieldfuse.capture.prepare import target_size
 from fieldfuse.capture.types import Capture
 from fieldfuse.config import PosesSettings

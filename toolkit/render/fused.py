@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 
 import torch
 
@@ -52,6 +53,4 @@ def without_empty_blocks(field: Field) -> Field:
     topology, occupied, (density, features) = erase_empty_blocks(
         field.topology, field.occupied, [field.density_rows.detach(), field.feature_rows.detach()]
     )
-    return Field(
-        field.space, field.resolution, topology, occupied, density, features, field.decoder, field.background, field.near, field.fine
-    )
+    return replace(field, topology=topology, occupied=occupied, density_rows=density, feature_rows=features)

@@ -113,18 +113,8 @@ class Film:
             facts["passers"] = {"share": float(passed.mean())}
         if effects.depth_offset is not None and self.has_depth:
             still = take(there, self._plain, (pose @ invert(effects.depth_offset.forward()))[None])
-        return Shot(
-            index=index,
-            seconds=seconds,
-            world_from_camera=pose,
-            rgb=rgb,
-            jpeg=jpeg,
-            depth=depth,
-            normals=normals,
-            sensor_depth=self._measured(still, index) if self.has_depth else None,
-            passed=passed,
-            facts=facts,
-        )
+        sensor_depth = self._measured(still, index) if self.has_depth else None
+        return Shot(index, seconds, pose, rgb, jpeg, depth, normals, sensor_depth, passed, facts)
 
     def _there(self, seconds: float) -> Scenery:
         """The scene, with whoever passes at that time."""

@@ -68,9 +68,6 @@ class Atlas:
         self.texels = torch.from_numpy(texels)
         self.table = torch.tensor(rows)
 
-    def _move(self, device: torch.device | str) -> None:
-        self.texels, self.table = self.texels.to(device), self.table.to(device)
-
     def sample(self, texture: Tensor, place: Tensor, footprint: Tensor) -> Tensor:
         """(N, 3) linear colour.
 
@@ -120,7 +117,7 @@ class TextureBank(Atlas):
         if self.texels.device == torch.device(device):
             return self
         moved = copy(self)
-        moved._move(device)
+        moved.texels, moved.table = self.texels.to(device), self.table.to(device)
         return moved
 
 

@@ -11,9 +11,9 @@ from fieldfuse.camera import Array
 from fieldfuse.effects.scenery import STEPS, Background, Highlights, Walk
 from fieldfuse.simulate.eye import Rays, Scenery, Seen
 from fieldfuse.simulate.furniture import Builder, turned
-from fieldfuse.simulate.materials import Material, Materials, TextureBank, texture_bank
+from fieldfuse.simulate.materials import Materials, TextureBank, texture_bank
 from fieldfuse.simulate.scene import Lamp, Scene
-from fieldfuse.simulate.solids import BALL, Mesh, Solid, Solids, rod, upright
+from fieldfuse.simulate.solids import BALL, Mesh, Solids, rod, upright
 
 AMBIENT = ((0.75, 0.75, 0.75), (0.4, 0.4, 0.4))  # of people in a mesh, which has its light in its colours
 STRIDE = 0.22  # of the height
@@ -55,17 +55,13 @@ def peopled(scene: Scenery, walks: Sequence[Walk], seconds: float) -> Scenery:
     if not here:
         return scene
     bank: TextureBank = scene.bank if isinstance(scene, Scene) else texture_bank()
-    solids: list[Solid] = []
-    materials: list[Material] = []
+    b = Builder(np.random.default_rng(), bank)
     for walk in here:
-        builder = Builder(np.random.default_rng(walk.looks), bank)
-        figure(builder, walk, seconds)
-        shift = len(materials)
-        solids += [Solid(one.kind, one.centre, one.half, one.rotation, tuple(shift + m for m in one.materials)) for one in builder.solids]
-        materials += builder.materials
+        b.rng = np.random.default_rng(walk.looks)
+        figure(b, walk, seconds)
     lamps: list[Lamp] = scene.lamps if isinstance(scene, Scene) else []
     ambient = scene.ambient if isinstance(scene, Scene) else AMBIENT
-    people = Scene("people", Solids(solids), Materials(materials), bank, lamps, ambient, scene.free, scene.focus)
+    people = Scene("people", Solids(b.solids), Materials(b.materials), bank, lamps, ambient, scene.free, scene.focus)
     return Peopled(scene, people.to(scene.device))
 
 

@@ -49,8 +49,7 @@ def view_seconds(side: float, aspect: float) -> float:
 
 def plan(views: int, budget: float, aspect: float = 0.75) -> tuple[int, int] | None:
     """Long side of the depth maps and n, where every n-th image is matched, for a fit to `views` images of `budget` seconds; None: they
-    are too
-    many for so short a fit."""
+    are too many for so short a fit."""
     if views < 2:
         return None
     least = view_seconds(LEAST_SIDE, aspect)

@@ -18,10 +18,9 @@ from fieldfuse.capture.checks import check_capture
 from fieldfuse.capture.images import load_image, load_mask
 from fieldfuse.capture.ply_points import read_ply_points
 from fieldfuse.capture.prepare import prepare_views
-from fieldfuse.capture.storage import capture_from_dict, capture_to_dict
+from fieldfuse.capture.storage import capture_from_dict, capture_to_dict, load_views, save_views
 from fieldfuse.capture.types import Capture, Views
 from fieldfuse.capture.video import iterate_video, read_video
-from fieldfuse.capture.views_file import load_views, save_views
 from fieldfuse.config import CaptureSettings, load_settings
 from fieldfuse.files import read_json, write_json
 from fieldfuse.poses.result import given_poses

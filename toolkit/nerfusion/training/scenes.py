@@ -13,6 +13,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import lru_cache
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import torch
@@ -23,11 +24,11 @@ from safetensors.torch import save_file
 from fieldfuse.camera import Array, Intrinsics, Similarity, invert
 from fieldfuse.capture.blender import looks_like_blender, read_blender
 from fieldfuse.capture.calibration import from_matrix
-from fieldfuse.capture.listing import assemble, files_in, natural_key, pictures_in, read_matrix, read_text, require_folder, same_count
+from fieldfuse.capture.headers import image_header
+from fieldfuse.capture.listing import assemble, files_in, images_in, natural_key, read_matrix, read_text, require_folder, same_count
 from fieldfuse.capture.poses import checked_pose
 from fieldfuse.capture.prepare import WHITE, prepare_views
 from fieldfuse.capture.scannet import looks_exported, packed, read_scannet
-from fieldfuse.capture.sizes import picture_header
 from fieldfuse.capture.types import Capture, Frame
 from fieldfuse.config import CaptureSettings
 from fieldfuse.errors import InputError, first_line
@@ -106,8 +107,8 @@ def write_shard(
     count, _, height, width = images.shape
     if depths.shape != (count, height, width) or intrinsics.shape != (count, 4) or world_from_camera.shape != (count, 4, 4):
         raise ValueError("images, depths, cameras and poses of a shard must have as many entries and one size")
-    given = {"images": (images, np.uint8), "depths": (depths, np.float32), "intrinsics": (intrinsics, np.float32)}
-    given["world_from_camera"] = world_from_camera, np.float64
+    given: dict[str, tuple[Array, Any]] = {"images": (images, np.uint8), "depths": (depths, np.float32)}
+    given |= {"intrinsics": (intrinsics, np.float32), "world_from_camera": (world_from_camera, np.float64)}
     tensors = {name: torch.from_numpy(np.ascontiguousarray(values, dtype=dtype)) for name, (values, dtype) in given.items()}
     with atomic_path(path) as temporary:
         save_file(tensors, temporary, metadata={"format": FORMAT, "kind": kind, "ordered": str(int(ordered))})
@@ -243,7 +244,7 @@ def scanned_object_scene(folder: Path, long_side: int) -> CapturedScene:
     """One object before white. Poses are world_from_camera in OpenCV axes, cameras 4×4 matrices, one text file an image. Images are opaque;
     all look at the origin, where the object is, so the distance from there is the depth."""
     root = require_folder(folder)
-    pictures = pictures_in(root / "rgb")
+    pictures = images_in(root / "rgb")
     same_count(len(pictures), len(files_in(root / "pose", "*.txt")), root)
     frames, alpha, distances = [], 0, []
     for picture in pictures:
@@ -251,7 +252,7 @@ def scanned_object_scene(folder: Path, long_side: int) -> CapturedScene:
         for file in (pose, camera):
             if not file.is_file():
                 raise InputError(f"{picture} has no {file}; add it or remove the picture")
-        header = picture_header(picture)
+        header = image_header(picture)
         alpha += header.alpha
         intrinsics = from_matrix(read_matrix(camera, (4, 4), (3, 3))[:3, :3], *header.size, str(camera))
         world_from_camera = checked_pose(read_matrix(pose, (4, 4)), str(pose))
@@ -309,7 +310,7 @@ def dtu_scene(scene: DtuScene, long_side: int) -> CapturedScene:
         if match is None or int(match[2]) != scene.light:
             continue
         view = int(match[1]) - 1
-        pose, intrinsics = _dtu_camera(cameras / f"{view:08d}_cam.txt", picture_header(picture).size)
+        pose, intrinsics = _dtu_camera(cameras / f"{view:08d}_cam.txt", image_header(picture).size)
         depth = next((path for base in scene.places("Depths") if (path := base / f"depth_map_{view:04d}.pfm").is_file()), None)
         of_depth = None if depth is None else _dtu_depth_camera(intrinsics, depth)
         frames.append(Frame(f"{view:04d}", picture, intrinsics, pose, depth=depth, depth_intrinsics=of_depth))
@@ -334,7 +335,7 @@ def _dtu_camera(path: Path, size: tuple[int, int]) -> tuple[Array, Intrinsics]:
 
 
 def _dtu_depth_camera(image: Intrinsics, path: Path) -> Intrinsics:
-    size = picture_header(path).size
+    size = image_header(path).size
     if size == FULL:
         return Intrinsics(*FULL, 2 * image.fx, 2 * image.fy, 2 * (image.cx + CROP[0]), 2 * (image.cy + CROP[1]))
     if size[0] * image.height != size[1] * image.width:

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from fieldfuse.camera import FISHEYE, OPENCV, Array, Intrinsics, invert
-from fieldfuse.capture.carried import _rays, carried
+from fieldfuse.capture.depth_reprojection import _rays, reprojected
 from fieldfuse.capture.images import load_depth
 from fieldfuse.capture.storage import capture_from_dict, capture_to_dict
 from fieldfuse.capture.types import Capture, Frame
@@ -43,13 +43,13 @@ def plane(camera: Intrinsics, normal: Array, offset: float) -> Array:
 def test_a_map_stays_as_it_is_where_nothing_moves(lens: str) -> None:
     depth = plane(LENSES[lens], np.array([0.2, -0.1, 1.0]), 2.0)
     depth[10:20, 30:50] = 0
-    np.testing.assert_allclose(carried(depth, LENSES[lens], np.eye(4)), depth, rtol=1e-6)
+    np.testing.assert_allclose(reprojected(depth, LENSES[lens], np.eye(4)), depth, rtol=1e-6)
 
 
 @pytest.mark.parametrize("lens", sorted(LENSES))
 def test_a_plane_is_where_it_is_from_the_other_place(lens: str) -> None:
     camera, normal = LENSES[lens], np.array([0.2, -0.1, 1.0])
-    got = carried(plane(camera, normal, 2.0), camera, ASIDE)
+    got = reprojected(plane(camera, normal, 2.0), camera, ASIDE)
     moved = ASIDE[:3, :3] @ normal  # n · x = o with x = Rᵀ (y − t)
     want = plane(camera, moved, 2.0 + moved @ ASIDE[:3, 3])
     inner = (slice(8, -8), slice(8, -8))
@@ -61,7 +61,7 @@ def test_a_plane_is_where_it_is_from_the_other_place(lens: str) -> None:
 def test_what_is_near_hides_what_is_behind_and_what_it_hid_is_not_known() -> None:
     depth = np.full((72, 96), 4.0, np.float32)
     depth[:, 40:56] = 1.0
-    got = carried(depth, CAMERA, pose((0, 0, 0), (0.1, 0, 0)))  # 8 pixels to the right at 1, 2 at 4
+    got = reprojected(depth, CAMERA, pose((0, 0, 0), (0.1, 0, 0)))  # 8 pixels to the right at 1, 2 at 4
     assert (got[:, 48:64] == 1).all()
     assert (got[:, :42] == np.where(np.arange(42) >= 2, 4, 0)).all()
     assert (got[:, 42:48] == 0).all(), "what the near surface hid"
@@ -71,7 +71,7 @@ def test_what_is_near_hides_what_is_behind_and_what_it_hid_is_not_known() -> Non
 def test_no_cracks_where_pixels_move_apart() -> None:
     depth = plane(CAMERA, np.array([0.0, 0.0, 1.0]), 2.0)
     depth[:, 48:] = 1.0  # two surfaces, and the camera comes nearer to both, turned about its axis
-    got = carried(depth, CAMERA, pose((0, 0, 0.03), (0, 0, -0.04)))
+    got = reprojected(depth, CAMERA, pose((0, 0, 0.03), (0, 0, -0.04)))
     left, right = got[10:-10, 10:38], got[10:-10, 62:-10]
     np.testing.assert_allclose(left, 1.96, rtol=1e-5)
     np.testing.assert_allclose(right, 0.96, rtol=1e-5)
@@ -79,7 +79,7 @@ def test_no_cracks_where_pixels_move_apart() -> None:
 
 def test_there_and_back() -> None:
     depth = plane(CAMERA, np.array([0.1, 0.15, 1.0]), 2.0)
-    again = carried(carried(depth, CAMERA, ASIDE), CAMERA, invert(ASIDE))
+    again = reprojected(reprojected(depth, CAMERA, ASIDE), CAMERA, invert(ASIDE))
     both = again > 0
     assert both.mean() > 0.9
     np.testing.assert_allclose(again[both], depth[both], rtol=0.006)

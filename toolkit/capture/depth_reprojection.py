@@ -1,20 +1,18 @@
-"""A depth map carried from the camera that measured it to one that stands and looks a little differently."""
+"""A depth map reprojected from the camera that measured it into one that stands and looks a little differently."""
 
 from __future__ import annotations
 
 from functools import lru_cache
 
 import cv2
-import numba
 import numpy as np
 
+from fieldfuse.backends.numba.depth_reprojection import close_cracks, splat_nearest
 from fieldfuse.camera import FISHEYE, Array, Intrinsics, distort, pixel_grid
 
-CRACK = 0.03  # share of depth by which what shows between two neighbours must lie behind them to be a crack
 
-
-def carried(depth: Array, camera: Intrinsics, moved: Array) -> Array:
-    """What the same camera would measure from another place, as far as the depth map tells.
+def reprojected(depth: Array, camera: Intrinsics, moved: Array) -> Array:
+    """What the same camera would measure from another place, as far as the depth map reaches.
 
     Each pixel goes where its point is seen; of several the nearest stays. Where pixels move apart, lines one pixel wide stay open or
     show what lies behind; they get the mean of the neighbours on either side.
@@ -30,17 +28,17 @@ def carried(depth: Array, camera: Intrinsics, moved: Array) -> Array:
     x, y = _rays(camera)
     rotation, translation = moved[:3, :3].astype(np.float32), moved[:3, 3].astype(np.float32)
     z = depth * (rotation[2, 0] * x + rotation[2, 1] * y + rotation[2, 2]) + translation[2]
-    there = (depth > 0) & (z > 0)
-    safe = np.where(there, z, np.float32(1))
+    valid = (depth > 0) & (z > 0)
+    safe = np.where(valid, z, np.float32(1))
     u = (depth * (rotation[0, 0] * x + rotation[0, 1] * y + rotation[0, 2]) + translation[0]) / safe
     v = (depth * (rotation[1, 0] * x + rotation[1, 1] * y + rotation[1, 2]) + translation[1]) / safe
     if camera.distorted:
         bent = distort(camera, np.stack([u.ravel(), v.ravel()], axis=1)).astype(np.float32)
         u, v = bent[:, 0].reshape(u.shape), bent[:, 1].reshape(v.shape)
     out = np.zeros_like(depth)
-    _nearest_of_each(u * np.float32(camera.fx) + np.float32(camera.cx), v * np.float32(camera.fy) + np.float32(camera.cy), z, there, out)
+    splat_nearest(u * np.float32(camera.fx) + np.float32(camera.cx), v * np.float32(camera.fy) + np.float32(camera.cy), z, valid, out)
     for axis in (0, 1, 0, 1):  # where two lines cross, more than one pixel is open
-        _close(out, axis)
+        close_cracks(out, axis)
     return out
 
 
@@ -56,32 +54,3 @@ def _rays(camera: Intrinsics) -> tuple[Array, Array]:
         ideal = np.asarray(undo(pixels[:, None], camera.matrix(), values)[:, 0], dtype=np.float64)
     shape = camera.height, camera.width
     return ideal[:, 0].astype(np.float32).reshape(shape), ideal[:, 1].astype(np.float32).reshape(shape)
-
-
-@numba.njit(cache=True, nogil=True)
-def _nearest_of_each(u: Array, v: Array, z: Array, there: Array, out: Array) -> None:
-    height, width = out.shape
-    for y in range(height):
-        for x in range(width):
-            if not there[y, x]:
-                continue
-            if not (0 <= u[y, x] < width and 0 <= v[y, x] < height):
-                continue
-            row, column = int(v[y, x]), int(u[y, x])
-            if out[row, column] == 0 or z[y, x] < out[row, column]:
-                out[row, column] = z[y, x]
-
-
-@numba.njit(cache=True, nogil=True)
-def _close(out: Array, axis: int) -> None:
-    """Pixels that are open, or lie behind both neighbours along the axis, where these are of one surface."""
-    before = out.copy()
-    height, width = out.shape
-    down, right = (1, 0) if axis == 0 else (0, 1)
-    for y in range(down, height - down):
-        for x in range(right, width - right):
-            one, other, own = before[y - down, x - right], before[y + down, x + right], before[y, x]
-            if one > 0 and other > 0 and abs(one - other) < CRACK * min(one, other):
-                middle = 0.5 * (one + other)
-                if own == 0 or own > (1 + CRACK) * max(one, other):
-                    out[y, x] = middle

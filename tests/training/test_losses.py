@@ -1,4 +1,4 @@
-"""The depth term: distances along rays, its gradient, and a fit that finds the surface where colours alone cannot."""
+"""The depth term and the scaling of gradients near cameras: distances, gradients, and a fit that finds a surface where colours cannot."""
 
 from __future__ import annotations
 
@@ -7,19 +7,24 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import torch
+from hypothesis import given, settings
+from hypothesis import strategies as st
 
+from fieldfuse.backends.numba.train_batch import near_scale
 from fieldfuse.camera import Intrinsics, Similarity
 from fieldfuse.capture.types import Views
 from fieldfuse.config import FitSettings
 from fieldfuse.poses.scene import Scene
 from fieldfuse.render.image import render_view
 from fieldfuse.training.fit import fit_field
-from fieldfuse.training.losses import FINE, REACH, ROUGH, Rates, Trust, depth_gradient
+from fieldfuse.training.losses import FINE, REACH, ROUGH, Rates, Trust, depth_gradient, near_gradient_scaling
 from fieldfuse.training.pixels import PixelPool, ray_distances
 from fieldfuse.training.schedule import Schedule
 from tests.poses.textured import arc, render
-from tests.training.gradients import made_views
+from tests.render.made import random_field
+from tests.training.gradients import made_views, torch_gradients
 from tests.training.test_fit import ticking, wanted
+from tests.training.test_numba import RATES
 
 
 def test_distances_along_rays_are_those_of_the_pools_directions() -> None:
@@ -122,3 +127,28 @@ def test_a_wall_without_texture_is_found_by_its_depth(weight: str, found: bool, 
     known = depth > 0
     error = np.where(rendered.depth > 0, np.abs(rendered.depth - depth) / np.maximum(depth, 1e-6), 1.0)[known]
     assert (float(np.median(error)) < 0.04) is found, float(np.median(error))
+
+
+BOUNDS = st.floats(0.0625, 100, width=32)
+DISTANCES = st.floats(-1, 1000, width=32)
+
+
+@settings(deadline=None)
+@given(distance=DISTANCES, within=BOUNDS)
+def test_both_engines_slow_a_sample_by_its_distance(distance, within):
+    factor = float(near_gradient_scaling(torch.tensor([distance]), within)[0])
+    assert factor == pytest.approx(min(max(distance, 0) / within, 1) ** 2, abs=1e-6)
+    assert float(near_scale(np.float32(distance), np.float32(within))) == pytest.approx(factor, abs=1e-6)
+
+
+@pytest.mark.parametrize("decoder", ["deferred", "per_sample"])
+def test_far_away_gradients_are_what_they_were(decoder):
+    """Cameras stand 3 before a box of half a side 1: a bound below the nearest corner changes nothing, one far beyond makes all gradients
+    of rows smaller."""
+    field = random_field(0.0, 32, decoder, keep=0.5, raw=-2.5)
+    batch = PixelPool(made_views(), depth=True).take(torch.arange(0, 2000, 7))
+    plain, below, beyond = (torch_gradients(field, batch, replace(RATES, slow_within=bound)) for bound in (0.0, 0.5, 20.0))
+    for one, other in zip(plain, below, strict=True):
+        assert torch.equal(one, other)
+    for one, other in zip(plain[:2], beyond[:2], strict=True):
+        assert 0 < float(other.norm()) < 0.1 * float(one.norm())
