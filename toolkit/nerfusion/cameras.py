@@ -69,7 +69,8 @@ class Cameras:
         parts = self.intrinsics, self.size, self.world_from_camera
         flat = torch.cat([part.reshape(-1) for part in parts])
         moved = (to_device_async(flat.numpy(), device) if on_cpu else flat.to(device)).split([part.numel() for part in parts])
-        return Cameras(*(new.view(old.shape) for new, old in zip(moved, parts, strict=True)), self if on_cpu else None)
+        intrinsics, size, poses = (new.view(old.shape) for new, old in zip(moved, parts, strict=True))
+        return Cameras(intrinsics, size, poses, self if on_cpu else None)
 
     @property
     def positions(self) -> Tensor:
