@@ -122,8 +122,8 @@ def once_each(frames: Sequence[Frame]) -> tuple[list[Frame], list[str]]:
     first: dict[Path, Frame] = {}
     for frame in frames:
         other = first.setdefault(frame.image, frame)
-        poses = other.world_from_camera, frame.world_from_camera
-        same = poses[0] is not None and poses[1] is not None and np.allclose(*poses, atol=1e-9)
+        one, two = other.world_from_camera, frame.world_from_camera
+        same = one is not None and two is not None and np.allclose(one, two, atol=1e-9)
         if other is not frame and (other.intrinsics != frame.intrinsics or not same):
             raise InputError(f"{frame.image} is listed twice, with different poses or cameras; keep the entry that is right")
     copies = len(frames) - len(first)
