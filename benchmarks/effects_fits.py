@@ -19,8 +19,7 @@ from fieldfuse.config import Settings
 from fieldfuse.effects.correct import Corrections
 from fieldfuse.effects.decide import asleep, choose_field, decide
 from fieldfuse.effects.diagnostics import Diagnostics
-from fieldfuse.evaluation.affine import right_half_psnr
-from fieldfuse.evaluation.images import psnr
+from fieldfuse.evaluation.metrics import psnr, right_half_psnr
 from fieldfuse.evaluation.score import RenderedView, as_photo, entry, mean
 from fieldfuse.poses.scene import describe_scene
 from fieldfuse.progress import SILENT, Progress

@@ -6,7 +6,6 @@ OUT/NAME.md, so an interrupted benchmark goes on when its command is repeated.
 
 from __future__ import annotations
 
-import os
 import re
 import shlex
 import sys
@@ -77,7 +76,7 @@ class Experiment:
         rows = self.earlier(out, progress)
         done = {self._key(row) for row in rows}
         todo = [entry for entry in self.plan if self._key(entry) not in done]
-        about = machine(threads or os.cpu_count() or 1) | {"device": device, "measured": time.strftime("%Y-%m-%d %H:%M")}
+        about = machine(threads, device)
         data: Row = {"experiment": self.name, "version": __version__, "command": command_line(), "machine": about, "state": self.state}
         data |= {**self.about, "rows": rows}
         order = {self._key(entry): place for place, entry in enumerate(self.plan)}

@@ -18,7 +18,7 @@ import typer
 from benchmarks.experiment import Experiment, Row, application, chosen, markdown, numbers, program, section, show
 from benchmarks.ground import Ground, Inferred, Opened, measured, opened
 from fieldfuse.errors import InputError
-from fieldfuse.evaluation.baseline import nearest_image_scores
+from fieldfuse.evaluation.score import nearest_image_scores
 from fieldfuse.nerfusion.model import NerfusionModel
 from fieldfuse.pipelines.options import Config, ImageSize, Out, Pairs, Quiet, Seed, Source, gather
 from fieldfuse.render.field import Field

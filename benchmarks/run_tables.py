@@ -17,8 +17,7 @@ from fieldfuse.evaluation.budget import AGREES
 from fieldfuse.evaluation.compare import compare_data, matching_line
 from fieldfuse.evaluation.compare import table as compared
 from fieldfuse.evaluation.page import short_name
-from fieldfuse.evaluation.tradeoff import METHODS, Point, in_order, pareto, points_of
-from fieldfuse.evaluation.tradeoff_text import front_sentence, sentence, setting_text, steps
+from fieldfuse.evaluation.tradeoff import METHODS, Point, front_sentence, in_order, pareto, points_of, sentence, setting_text, steps
 
 HEAD = ("capture", "views", "pixels", "how", "PSNR", "SSIM", "LPIPS", "nearest image", "field made in", "peak memory", "whole run")
 PLAIN = ("images", "frames", "photos")
@@ -167,7 +166,7 @@ def tradeoff_table(data: Row) -> str:
     points, unit = points_of(data["rows"]), data["unit"] or "units"
     fronts = [{point.id for point in pareto(points, cost)} for cost in ("seconds", "memory_mb")]
     depth = any("depth_error" in point.mean for point in points)
-    text = [f"{line}\n" for cost in ("seconds", "memory_mb") if (line := front_sentence(points, cost, "psnr", unit)) is not None]
+    text = [f"{line}\n" for cost in ("seconds", "memory_mb") if (line := front_sentence(points, cost, unit)) is not None]
     head = ["method", "setting", "time", "memory", "on disk", "PSNR", "SSIM", "LPIPS", *(["depth error"] if depth else []), "unbeaten in"]
     text.append(markdown(head, (_point_cells(point, fronts, depth, unit) for point in in_order(points) if not point.shown_otherwise)))
     text += [f"- {sentence(step, unit)}" for step in steps(points)]

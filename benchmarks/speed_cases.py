@@ -11,8 +11,6 @@ import torch.nn.functional as F
 
 from benchmarks.timing import Case, compare, pinned
 from fieldfuse.evaluation.sphere import around, lens, sphere_field, sphere_pixels
-from fieldfuse.render.bake import bake
-from fieldfuse.render.bake_image import BakedRenderer
 from fieldfuse.render.numba_renderer import NumbaRenderer
 from fieldfuse.render.rays import render_rays
 from fieldfuse.training.losses import Rates
@@ -58,7 +56,7 @@ def step_counts(engine: NumbaEngine) -> dict[str, float]:
 
 
 def render_cases(sizes: tuple[int, ...] = SIZES, side: int = 128, repetitions: int = 5) -> Iterator[Case]:
-    """Rays of a picture: compiled against torch, and baked against compiled, one thread."""
+    """Rays of a picture: compiled against torch, one thread."""
     camera, pose = lens(side, side), around()[1]
     from fieldfuse.camera import pixel_grid, rays
 
@@ -66,34 +64,23 @@ def render_cases(sizes: tuple[int, ...] = SIZES, side: int = 128, repetitions: i
         for size in sizes:
             field = sphere_field(size)
             origins, directions, _ = rays(camera, pose, pixel_grid(side, side))
-            compiled, baked = NumbaRenderer(field, 1), BakedRenderer(bake(field), 1)
+            compiled = NumbaRenderer(field, 1)
             few = origins[:: side // 16], directions[:: side // 16]
             times = compare(lambda c=compiled, f=few: c.render(*f), lambda d=field, f=few: render_rays(d, *f), repetitions)  # type: ignore[misc]
             yield Case("rendering", f"{size}³", "ray", len(few[0]), *times, against="torch engine")
-            work = baked.render_counted(camera, pose)[1]
-            counts = {
-                "looked_up_a_ray": round(work.looked_up / work.rays, 3),
-                "coloured_a_ray": round(work.coloured / work.rays, 3),
-                "fine_steps_a_ray": round(work.walked / work.rays, 3),
-                "bytes_a_voxel": round(baked.field.bytes / baked.field.voxels, 1),
-            }
-            times = compare(
-                lambda b=baked: b.render(camera, pose),  # type: ignore[misc]
-                lambda c=compiled, o=origins, d=directions: c.render(o, d),  # type: ignore[misc]
-                repetitions,
-            )
-            yield Case("baked rendering", f"{size}³", "ray", side * side, *times, against="compiled engine", counts=counts)
 
 
 def thread_cases(threads: int, size: int = 128, repetitions: int = 5) -> Iterator[Case]:
     """Several threads against one, by the wall clock."""
     pool, field = sphere_pixels(), sphere_field(size)
-    camera, pose, baked = lens(256, 256), around()[1], bake(field)
+    from fieldfuse.camera import pixel_grid, rays
+
+    given = rays(lens(256, 256), around()[1], pixel_grid(256, 256))[:2]
     many, one = (NumbaEngine(sphere_field(size), pool, threads=n) for n in (threads, 1))
-    renderers = [BakedRenderer(baked, n) for n in (threads, 1)]
+    renderers = [NumbaRenderer(field, n) for n in (threads, 1)]
     pairs: list[tuple[str, int, Callable[[], Any], Callable[[], Any]]] = [
         ("training step", 4 * BATCH, lambda: many.step(4 * BATCH, RATES), lambda: one.step(4 * BATCH, RATES)),
-        ("baked rendering", 256 * 256, lambda: renderers[0].render(camera, pose), lambda: renderers[1].render(camera, pose)),
+        ("rendering", 256 * 256, lambda: renderers[0].render(*given), lambda: renderers[1].render(*given)),
     ]
     for name, units, ours, reference in pairs:
         times = compare(ours, reference, repetitions)

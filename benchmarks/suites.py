@@ -18,8 +18,8 @@ from fieldfuse.config import settings_dict
 from fieldfuse.effects.correct import Corrections
 from fieldfuse.errors import FieldfuseError, Interrupted, OutputError
 from fieldfuse.evaluation import words
-from fieldfuse.evaluation.compare_score import compare_views
 from fieldfuse.evaluation.report import plain
+from fieldfuse.evaluation.score import compare_views
 from fieldfuse.pipelines.console import ConsoleProgress, make_progress
 from fieldfuse.pipelines.direct_field import direct_field, weights_state
 from fieldfuse.pipelines.fields import finished_field, render_test_views

@@ -13,7 +13,7 @@ import typer
 from benchmarks.experiment import Row, application, checked, portable, program, put_between_marks, section
 from benchmarks.run_tables import budget_table, compare_table, is_report, mean_load, run_table, tradeoff_table
 from fieldfuse.errors import InputError
-from fieldfuse.evaluation.tradeoff_page import tradeoff_data
+from fieldfuse.evaluation.tradeoff import tradeoff_data
 from fieldfuse.pipelines import schemas
 
 

@@ -2,15 +2,15 @@
 
 from __future__ import annotations
 
-import time
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Annotated, Any
 
 import typer
 
-from fieldfuse.pipelines.baking import SEEN
 from fieldfuse.pipelines.options import Options, Place, bound_threads, show, takes
+
+SEEN = 0.01  # as `fieldfuse.render.bake` has it
 
 
 @takes("threads config pairs quiet json")
@@ -48,47 +48,43 @@ def bake_run(place: Place, options: dict[str, Any], seen: float, to: Path | None
         OutputError: the file cannot be written.
     """
     import numpy as np
-    import torch
 
-    from fieldfuse.evaluation.images import psnr
-    from fieldfuse.evaluation.score import as_photo
-    from fieldfuse.pipelines.baking import default_place, write
+    from fieldfuse.evaluation.metrics import psnr
+    from fieldfuse.evaluation.score import as_photo, entry
     from fieldfuse.pipelines.console import make_progress
     from fieldfuse.pipelines.fields import finished_field
     from fieldfuse.pipelines.job import open_job
+    from fieldfuse.pipelines.pictures import baked, baked_place
     from fieldfuse.pipelines.prepare import prepare
     from fieldfuse.pipelines.rendered import to_picture
     from fieldfuse.pipelines.stages import BEFORE
-    from fieldfuse.render.bake_image import BakedRenderer
+    from fieldfuse.render.bake_file import read_baked, write_baked
     from fieldfuse.render.image import make_renderer, render_view
 
     with open_job(place, options, make_progress(quiet), (*BEFORE, "field")) as job:
         ready = prepare(job)
-        scene, views = ready.scene, ready.views
-        field = finished_field(job, ready).field.to("cpu")
-        job.progress.begin("bake")
-        start = time.monotonic()
-        target = to or default_place(job)
-        baked = write(job, field, views, scene, seen, target)
-        renderer, view = BakedRenderer(baked, torch.get_num_threads()), make_renderer(field)
-        scores = []
-        for index in np.flatnonzero(views.test):
-            job.progress.check()
-            lens, pose = views.intrinsics[index], views.world_from_camera[index]
-            truth = views.photo(int(index))
-            valid = views.valid[index] if views.valid else None
-            # In 8 bits, as the report's are: without them a good field would have some hundredths of a decibel more here.
-            pictures = to_picture(render_view(field, lens, pose, view)), to_picture(renderer.render(lens, pose))
-            pair = [psnr(as_photo(picture, views, int(index)), truth, valid) for picture in pictures]
-            if None not in pair:
-                scores.append(pair)
-        job.progress.finish("bake", time.monotonic() - start, False)
+        views, field = ready.views, finished_field(job, ready).field.to("cpu")
+        target = to or baked_place(job)
+        with job.progress.stage("bake"):
+            write_baked(target, baked(job, field, views, seen), ready.scene.working_from_input)
+            small = read_baked(target)
+            shown = [(one, make_renderer(one)) for one in (field, small.to_field())]
+            scores = []
+            for index in map(int, np.flatnonzero(views.test)):
+                job.progress.check()
+                lens, pose = views.intrinsics[index], views.world_from_camera[index]
+                truth, valid = views.photo(index), entry(views.valid, index)
+                # In 8 bits, as the report's are: without them a good field would have some hundredths of a decibel more here.
+                renders = [to_picture(render_view(one, lens, pose, view)) for one, view in shown]
+                pair = [psnr(as_photo(render, views, index), truth, valid) for render in renders]
+                if None not in pair:
+                    scores.append(pair)
     mean = np.mean(np.array(scores, np.float64), 0) if scores else None
     return {
         "to": str(target),
         "bytes": target.stat().st_size,
         "field_bytes": field.bytes,
-        "voxels": baked.voxels,
+        "voxels": small.voxels,
         "field_voxels": field.voxels,
         "psnr": None if mean is None else round(float(mean[0]), 3),
         "loss": None if mean is None else round(float(mean[0] - mean[1]), 3),

@@ -231,9 +231,9 @@ def make_progress(quiet: bool = False, stream: IO[str] | None = None) -> Console
 
 def table_lines(data: dict[str, Any]) -> Iterator[str]:
     """The report's numbers as one table."""
-    from fieldfuse.evaluation.table import WIDEST, table  # rich and the metrics are needed only here
+    from fieldfuse.evaluation.terminal import WIDEST, report_text  # rich and the metrics are needed only here
 
-    yield str(table(data, min(columns(sys.stdout) or WIDEST, WIDEST))).rstrip()
+    yield str(report_text(data, min(columns(sys.stdout) or WIDEST, WIDEST))).rstrip()
 
 
 def columns(stream: IO[str]) -> int | None:

@@ -17,13 +17,12 @@ from fieldfuse.capture.select import SELECTED
 from fieldfuse.capture.types import Capture
 from fieldfuse.errors import InputError
 from fieldfuse.export.cameras import write_cameras
-from fieldfuse.export.field_surface import Originals, at_most, surface_of_field, whole_mesh
+from fieldfuse.export.surface import Originals, at_most, surface_of_field, whole_mesh
 from fieldfuse.files import write_json
 from fieldfuse.memory import require_pictures
 from fieldfuse.pipelines.fields import Fitted
 from fieldfuse.pipelines.job import Job
-from fieldfuse.pipelines.page import NAME, PAGE, put_page
-from fieldfuse.pipelines.pictures import camera_of, orbit_cameras, pictures
+from fieldfuse.pipelines.pictures import NAME, PAGE, camera_of, orbit_cameras, pictures, put_page
 from fieldfuse.pipelines.prepare import Prepared
 from fieldfuse.pipelines.schemas import read_export_facts
 from fieldfuse.pipelines.stages import CollectingStage

@@ -14,10 +14,8 @@ import numpy as np
 from fieldfuse import steps
 from fieldfuse.config import FitSettings
 from fieldfuse.errors import InputError
-from fieldfuse.evaluation.baseline import nearest_image_scores
-from fieldfuse.evaluation.observed import seen_share, training_psnr
 from fieldfuse.evaluation.pictures import depth_picture, depth_range
-from fieldfuse.evaluation.score import score_views
+from fieldfuse.evaluation.score import nearest_image_scores, score_views, seen_share, training_psnr
 from fieldfuse.files import fingerprint, write_json
 from fieldfuse.memory import require_scores
 from fieldfuse.pipelines.job import Job

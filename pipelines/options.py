@@ -48,7 +48,7 @@ Decoder = Annotated[str | None, option("deferred (default) or per_sample (the pa
 Init = Annotated[str | None, option(_START)]
 Finetune = Annotated[bool | None, option(_FINETUNE, "--finetune/--no-finetune")]
 PosesFrom = Annotated[str | None, option("auto (default), given, or sfm: ignore given poses.", "--poses")]
-Baked = Annotated[bool, option("Take the baked field (about twice as fast on a CPU); it is made if need be.", "--baked")]
+Baked = Annotated[bool, option("Take the baked field, as pages have it; it is made if need be.", "--baked")]
 Config = Annotated[Path | None, option("YAML file with settings.")]
 Pairs = Annotated[list[str] | None, option("Any setting as key=value; may be repeated.", "--set", metavar="KEY=VALUE")]
 Quiet = Annotated[bool, typer.Option("--quiet", "-q", help="Say nothing but errors.")]

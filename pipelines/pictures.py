@@ -1,14 +1,16 @@
-"""Pictures of a field along a path of cameras, one at a time."""
+"""Renders of a field along a path of cameras, its baked copy, and the page that any browser walks through."""
 
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator
 from dataclasses import replace
 from functools import partial
+from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+import numpy as np
+
 from fieldfuse.camera import Array, Intrinsics
-from fieldfuse.pipelines.baking import baked_of
 from fieldfuse.pipelines.rendered import to_picture
 from fieldfuse.progress import Progress
 from fieldfuse.tone import exposed
@@ -17,27 +19,31 @@ if TYPE_CHECKING:
     from fieldfuse.capture.types import Views
     from fieldfuse.pipelines.job import Job
     from fieldfuse.poses.scene import Scene
+    from fieldfuse.render.bake import BakedField
     from fieldfuse.render.field import Field
 
 Camera = Callable[[Intrinsics, Array], Any]  # lens, pose → a `Rendered`
+PAGE = "page"  # as `export.formats` has it
+NAME = "field.html"
+FLIGHT = 90  # cameras along the page's flight
 
 
 def camera_of(job: Job, field: Field, views: Views, scene: Scene, baked: bool) -> Camera:
-    """What takes pictures of the field, or of its baked copy, as bright as the training pictures are."""
-    from fieldfuse.render.bake_image import BakedRenderer
+    """What renders the field, or its baked copy, as bright as the training images are."""
     from fieldfuse.render.image import make_renderer, render_view
 
     if baked:
-        camera: Camera = BakedRenderer(baked_of(job, field, views, scene)).render
-    else:
-        camera = partial(render_view, field, view=make_renderer(field))
+        field = baked_of(job, field, views, scene).to_field()
+    camera = partial(render_view, field, view=make_renderer(field))
     exposure = views.exposure
-    return camera if exposure == 1 else lambda lens, pose: _exposed(camera(lens, pose), exposure)
+    if exposure == 1:
+        return camera
 
+    def brighter(lens: Intrinsics, pose: Array) -> Any:
+        rendered = camera(lens, pose)
+        return replace(rendered, rgb=exposed(to_picture(rendered).rgb, exposure))  # colours become bytes by it
 
-def _exposed(rendered: Any, exposure: float) -> Any:
-    """Colours become bytes by it."""
-    return replace(rendered, rgb=exposed(to_picture(rendered).rgb, exposure))
+    return brighter
 
 
 def pictures(camera: Camera, lenses: list[Intrinsics], poses: Array, progress: Progress) -> Iterator[Array]:
@@ -48,15 +54,58 @@ def pictures(camera: Camera, lenses: list[Intrinsics], poses: Array, progress: P
         yield to_picture(camera(lens, pose)).rgb
 
 
-def even(lens: Intrinsics) -> Intrinsics:
-    """The camera without its last odd row and column: video formats store colour at half the size."""
-    return replace(lens, width=max(2, lens.width // 2 * 2), height=max(2, lens.height // 2 * 2))
-
-
 def orbit_cameras(views: Views, scene: Scene, frames: int) -> tuple[list[str], list[Intrinsics], Array]:
-    """A closed path around what the training cameras look at."""
+    """A closed path around what the training cameras look at. Video formats store colour at half the size, so sides are even."""
     from fieldfuse.render.paths import orbit
 
-    poses = orbit(views.world_from_camera, scene.centre, frames)
-    lens = even(views.intrinsics[0])
+    poses, lens = orbit(views.world_from_camera, scene.centre, frames), views.intrinsics[0]
+    lens = replace(lens, width=max(2, lens.width // 2 * 2), height=max(2, lens.height // 2 * 2))
     return [f"orbit_{index:03d}" for index in range(len(poses))], [lens] * len(poses), poses
+
+
+def baked(job: Job, field: Field, views: Views, seen: float | None = None) -> BakedField:
+    """The field baked in memory, without voxels of which no training view shows more than `seen`.
+
+    Raises:
+        InputError: a decoder that cannot be baked.
+    """
+    from fieldfuse.memory import require_baking
+    from fieldfuse.render.bake import SEEN, bake, seen_voxels
+
+    field = field.to("cpu")
+    require_baking(field)
+    keep, train, seen = None, np.flatnonzero(~views.test), SEEN if seen is None else seen
+    if seen > 0:
+        keep = seen_voxels(field, [views.intrinsics[i] for i in train], views.world_from_camera[train], seen, job.progress)
+    return bake(field, keep)
+
+
+def baked_place(job: Job) -> Path:
+    """Where a run's baked field lies."""
+    return job.folder / "exports" / "baked.safetensors"
+
+
+def baked_of(job: Job, field: Field, views: Views, scene: Scene) -> BakedField:
+    """The run's baked field; made first where there is none, or one of an earlier fit."""
+    from fieldfuse.render.bake_file import read_baked, write_baked
+
+    place, source = baked_place(job), job.folder / "field.safetensors"
+    if not (place.is_file() and source.is_file() and place.stat().st_mtime_ns >= source.stat().st_mtime_ns):
+        write_baked(place, baked(job, field, views), scene.working_from_input)
+    return read_baked(place)
+
+
+def put_page(job: Job, path: Path, field: Field, views: Views, scene: Scene) -> Path:
+    """The baked field as a page that any browser walks through, with the places of all images (not the images) and a flight.
+
+    Raises:
+        InputError: a decoder that cannot be baked, or is too wide for a page.
+        OutputError: the file cannot be written.
+    """
+    from fieldfuse.export.page import Tour, require_page, write_page
+
+    require_page(field)
+    _, _, around = orbit_cameras(views, scene, FLIGHT)
+    cameras = (views.names, views.intrinsics, views.world_from_camera, views.test)
+    write_page(path, baked(job, field, views), Tour(*cameras, around, scene.median_depth, views.exposure), job.source.name)
+    return path

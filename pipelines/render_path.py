@@ -19,8 +19,8 @@ from fieldfuse.files import read_json, remove
 from fieldfuse.memory import require_pictures
 from fieldfuse.pipelines.console import make_progress
 from fieldfuse.pipelines.fields import finished_field
-from fieldfuse.pipelines.job import Job, open_job
-from fieldfuse.pipelines.pictures import Camera, camera_of, orbit_cameras, pictures
+from fieldfuse.pipelines.job import open_job
+from fieldfuse.pipelines.pictures import camera_of, orbit_cameras, pictures
 from fieldfuse.pipelines.prepare import prepare
 from fieldfuse.pipelines.rendered import file_name, write_png
 from fieldfuse.pipelines.stages import BEFORE
@@ -36,7 +36,7 @@ MAX_CAMERAS = 100_000
 
 
 def render_run(place: Place, path: CameraPath, options: dict[str, Any], baked: bool, quiet: bool) -> dict[str, Any]:
-    """Render what is asked for; the field of a run's folder is taken as it is.
+    """Render along a path of cameras; the field of a run's folder is taken as it is.
 
     Returns:
         how many `pictures` of which `width` and `height`, the `seconds` it took, the path `to`, and how many `others` lie there besides.
@@ -45,62 +45,44 @@ def render_run(place: Place, path: CameraPath, options: dict[str, Any], baked: b
         InputError: an unknown path of cameras, cameras that cannot be used, a folder without a field and without its source.
         OutputError: the result cannot be written.
     """
-    views, cameras, to = path.views, path.cameras, path.to
-    if views not in ("orbit", "test"):
-        raise InputError(f"--views is {views!r}; it must be orbit or test")
-    if to is not None and to.suffix and to.suffix.lower() not in VIDEO:
-        raise InputError(f"--to {to} must be an .mp4 file or a folder")
-    given = read_cameras(cameras) if cameras is not None else None
+    if path.views not in ("orbit", "test"):
+        raise InputError(f"--views is {path.views!r}; it must be orbit or test")
+    if path.to is not None and path.to.suffix and path.to.suffix.lower() not in VIDEO:
+        raise InputError(f"--to {path.to} must be an .mp4 file or a folder")
+    given = read_cameras(path.cameras) if path.cameras is not None else None
     with open_job(place, options, make_progress(quiet), (*BEFORE, "field")) as job:
-        prepared = prepare(job)
-        scene, ready = prepared.scene, prepared.views
-        field = finished_field(job, prepared).field
+        ready = prepare(job)
+        scene, views, field = ready.scene, ready.views, finished_field(job, ready).field
         if given is not None:
-            names, lenses, poses = given[0], given[1], scene.working_from_input.poses(given[2])
-        elif views == "test":
-            names, lenses, poses = test_cameras(ready)
+            own, (names, lenses, poses) = "cameras", given
+            poses = scene.working_from_input.poses(poses)
+        elif path.views == "test":
+            own, (names, lenses, poses) = "test", test_cameras(views)
         else:
-            names, lenses, poses = orbit_cameras(ready, scene, path.frames)
+            own, (names, lenses, poses) = "orbit.mp4", orbit_cameras(views, scene, path.frames)
         lenses = [sized(lens, path.image_size) for lens in lenses]
-        own = job.folder / "renders" / (
-            "orbit.mp4" if given is None and views == "orbit" else "cameras" if given is not None else "test"
-        )
-        target = to or own
+        target = path.to or job.folder / "renders" / own
         require_pictures(lenses, kept=False)
         start = time.monotonic()
         job.progress.begin("render")
-        others = write(job, camera_of(job, field, ready, scene, baked), names, lenses, poses, target, path.fps, alone=to is None)
+        frames = pictures(camera_of(job, field, views, scene, baked), lenses, poses, job.progress)
+        others = 0
+        if target.suffix.lower() in VIDEO:
+            from fieldfuse.export.video import write_video
+
+            if len({(lens.width, lens.height) for lens in lenses}) > 1:
+                raise InputError("a video needs pictures of one size and these cameras differ; give a folder with --to, or --image-size")
+            write_video(target, frames, path.fps)
+        else:
+            # The command's own folder: its pictures take the place of those that an earlier command left there, when all are rendered.
+            with _replacing(target) if path.to is None else nullcontext(target) as folder:
+                stems = (f"{index:04d}_{file_name(Path(name).stem)}" for index, name in enumerate(names))
+                written = {write_png(folder / f"{stem}.png", frame).name for stem, frame in zip(stems, frames, strict=True)}
+            others = sum(found.name not in written for found in target.glob("*.png"))
         seconds = time.monotonic() - start
         job.progress.finish("render", seconds, False)
     size = {"width": lenses[0].width, "height": lenses[0].height}
     return {"pictures": len(names), **size, "seconds": round(seconds, 3), "to": str(target), "others": others}
-
-
-def write(
-    job: Job, camera: Camera, names: list[str], lenses: list[Intrinsics], poses: Array, to: Path, fps: float, alone: bool = False
-) -> int:
-    """Render every camera and write it as it comes.
-
-    Args:
-        alone: the pictures take the place of those that an earlier command left in the folder, when all are rendered.
-
-    Returns:
-        how many other pictures lie in the folder.
-    """
-    frames = pictures(camera, lenses, poses, job.progress)
-    if to.suffix.lower() in VIDEO:
-        from fieldfuse.export.video import write_video
-
-        if len({(lens.width, lens.height) for lens in lenses}) > 1:
-            raise InputError("a video needs pictures of one size and these cameras differ; give a folder with --to, or --image-size")
-        write_video(to, frames, fps)
-        return 0
-    with _replacing(to) if alone else nullcontext(to) as folder:
-        written = {
-            write_png(folder / f"{index:04d}_{file_name(Path(name).stem)}.png", frame).name
-            for index, (name, frame) in enumerate(zip(names, frames, strict=True))
-        }
-    return sum(path.name not in written for path in to.glob("*.png"))
 
 
 @contextmanager

@@ -15,7 +15,7 @@ from fieldfuse.camera import Array, Intrinsics, Similarity
 from fieldfuse.capture.types import Views
 from fieldfuse.errors import InputError
 from fieldfuse.evaluation.compare_truth import find_truth, true_depths
-from fieldfuse.export.field_surface import whole_mesh
+from fieldfuse.export.surface import whole_mesh
 from fieldfuse.memory import require_pictures
 from fieldfuse.pipelines.job import Job
 from fieldfuse.pipelines.prepare import Prepared

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from fieldfuse.export.field_surface import Originals
+from fieldfuse.export.surface import Originals
 from fieldfuse.pipelines.stages import Stage
 from fieldfuse.tone import exposed
 
@@ -40,7 +40,7 @@ def put_textured(job: Job, ready: Prepared, path: Path, mesh: Mesh) -> Path:
     """A coarser mesh (working frame, with normals) with a texture of the training pictures, in the input's frame."""
     from fieldfuse import memory
     from fieldfuse.export.mesh import write_textured
-    from fieldfuse.export.texture import LARGEST, textured
+    from fieldfuse.export.texture import LARGEST, Photos, textured
 
     largest = LARGEST
     while largest > 1024 and TEXEL_BYTES * largest**2 > memory.bounded(TEXEL_BYTES * LARGEST**2):
@@ -48,7 +48,7 @@ def put_textured(job: Job, ready: Prepared, path: Path, mesh: Mesh) -> Path:
     thin = mesh.decimated(TRIANGLES)
     train, shown = np.flatnonzero(~ready.views.test), ready.training
     lenses, images = Originals(ready.posed, ready.corrections).at(train, shown, job.settings.export.texture_size)
-    cameras = (lenses, shown.world_from_camera, shown.valid, shown.weight)
-    atlas, texture = textured(thin, images, *cameras, largest=largest, progress=job.progress)
+    photos = Photos(images, lenses, shown.world_from_camera, shown.valid, shown.weight)
+    atlas, texture = textured(thin, photos, largest, job.progress)
     write_textured(path, thin, atlas, exposed(texture, ready.views.exposure), ready.scene.working_from_input)
     return path

@@ -23,7 +23,7 @@ from fieldfuse.evaluation.budget_probe import self_test
 from fieldfuse.files import fingerprint, read_json, write_json
 from fieldfuse.pipelines.exports import TEXTURE
 from fieldfuse.pipelines.job import Job
-from fieldfuse.pipelines.page import PAGE
+from fieldfuse.pipelines.pictures import PAGE
 from fieldfuse.pipelines.prepare import Prepared
 from fieldfuse.pipelines.source import picture_size
 from fieldfuse.pipelines.textured import TSDF_TEXTURE

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import shlex
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Annotated, Any
@@ -39,120 +38,19 @@ def tradeoff(
     settings = options.settings()
     bound_threads(settings)
     from fieldfuse.pipelines.console import make_progress
+    from fieldfuse.pipelines.tradeoff_sweep import Choice, tradeoff_run
 
-    data = tradeoff_run(place, settings, axes, times, seeds, budget, make_progress(options.quiet))
+    data = tradeoff_run(place, settings, Choice(axes, times, seeds, budget), make_progress(options.quiet))
     show(data, options, lambda: lines(data, place.folder))
-
-
-def tradeoff_run(
-    place: Place,
-    options: dict[str, Any],
-    axes: str | None = None,
-    times: str | None = None,
-    seeds: int = 1,
-    budget: float | None = None,
-    progress: Any = None,
-) -> dict[str, Any]:
-    """Measure what is missing and write `tradeoff.csv`, `tradeoff.html` and the plots; answers `tradeoff.json`.
-
-    Raises:
-        InputError: no test views, an axis that cannot be varied, times that are no numbers.
-        Interrupted: the user asked to stop; what was measured is written.
-    """
-    from fieldfuse.errors import InputError
-    from fieldfuse.pipelines.console import make_progress
-    from fieldfuse.pipelines.job import open_job
-    from fieldfuse.pipelines.prepare import prepare
-    from fieldfuse.pipelines.stages import BEFORE
-    from fieldfuse.pipelines.surfaces import match_images
-    from fieldfuse.pipelines.tradeoff_plan import chosen_axes, chosen_times, plan
-    from fieldfuse.pipelines.tradeoff_sweep import Swept, sweep
-
-    ladder = chosen_times(times)
-    progress = make_progress(True) if progress is None else progress
-    with open_job(place, options, progress, (*BEFORE, "stereo")) as job:
-        can_vary, why_not = axes_here(job.settings)
-        chosen = chosen_axes(axes, can_vary, why_not)
-        ready = prepare(job)
-        if not ready.views.test.any():
-            raise InputError("what accuracy costs is measured on pictures kept for testing, and there is none; give --holdout 8")
-        surface: str | None = "tsdf" if ready.posed.has_depth else "tsdf_stereo"
-        refused = [f"The axis {name} was not varied: {why}." for name, why in why_not.items()]
-        if surface == "tsdf_stereo":
-            try:
-                match_images(job, ready)
-            except InputError as error:  # a camera that only moves forward leaves nothing to match; the field can still be measured
-                surface = None
-                refused.append(f"No surface was made: {error}.")
-        stereo = job.stages.records["stereo"].seconds if "stereo" in job.stages.records else 0.0
-        swept, wanted = Swept([], []), plan(chosen, ladder, seeds, surface)
-        try:
-            sweep(job, wanted, stereo, budget, swept)
-        finally:
-            done = {(row["id"], row["seed"]) for row in swept.rows}
-            swept.left_out = [one.name for one in wanted if (one.id, one.seed) not in done]
-            # What was measured is shown, however the sweep ends.
-            data = put(job, swept, ready, refused)
-    return data
-
-
-def axes_here(settings: Any) -> tuple[list[str], dict[str, str]]:
-    """The axes that can be varied, and for the others why not."""
-    from fieldfuse.evaluation.tradeoff import AXES
-    from fieldfuse.training.from_network import SHIPPED
-
-    why_not = {}
-    if not SHIPPED.is_file():
-        why_not["keyframes"] = "only the networks have key frames, and their weights are not installed"
-    if settings.field.decoder == "per_sample":
-        why_not["precision"] = "a field with the decoder per sample is stored in one precision only"
-        why_not["decoder"] = "it is set; leave out --decoder to compare both"
-    return [axis for axis in AXES if axis not in why_not], why_not
-
-
-def put(job: Any, swept: Any, ready: Any, refused: list[str]) -> dict[str, Any]:
-    """Write what is known so far into the run's folder."""
-    from fieldfuse.evaluation.tradeoff_page import write_tradeoff
-    from fieldfuse.pipelines.comparison import machine
-    from fieldfuse.pipelines.summary import base_data, warnings_of
-
-    base, scene, views = base_data(job, ready.capture, ready.poses), ready.scene, ready.views
-    data = {
-        **base,
-        "command": unbounded(base["command"]),
-        "warnings": warnings_of(job, ready),
-        "scene": scene.to_dict(),
-        "unit": "m" if scene.metric else "units",
-        "views": {
-            "total": len(views),
-            "test": int(views.test.sum()),
-            "width": views.intrinsics[0].width,
-            "height": views.intrinsics[0].height,
-        },
-        "rows": swept.rows,
-        "left_out": swept.left_out,
-        "refused": refused,
-        "machine": machine(job),
-    }
-    return write_tradeoff(job.folder.path, data)
-
-
-def unbounded(command: str) -> str:
-    """The command without `--budget`, which bounds one call of several: this one makes every row at once."""
-    parts = shlex.split(command)
-    named = [index for index, part in enumerate(parts) if part == "--budget"]
-    drop = {*named, *(index + 1 for index in named), *(index for index, part in enumerate(parts) if part.startswith("--budget="))}
-    return shlex.join(part for index, part in enumerate(parts) if index not in drop)
 
 
 def lines(data: dict[str, Any], folder: Path) -> Iterator[str]:
     """Sentences on what was measured, remarks, and where the page is."""
-    from fieldfuse.evaluation.tradeoff import points_of
-    from fieldfuse.evaluation.tradeoff_text import front_sentence, sentence, steps
+    from fieldfuse.evaluation.tradeoff import COSTS, front_sentence, points_of, sentence, steps
 
     points, unit = points_of(data["rows"]), data["unit"] or "units"
     yield from (sentence(step, unit) for step in steps(points))
-    yield from (text for cost in ("seconds", "memory_mb") if (text := front_sentence(points, cost, "psnr", unit)) is not None)
+    yield from (text for cost in COSTS if (text := front_sentence(points, cost, unit)) is not None)
     yield from (f"note: {row['id']}: {row['error']}" for row in data["rows"] if row["error"] is not None)
     yield from (f"note: not measured yet: {name}" for name in data["left_out"])
     yield from (f"note: {warning}" for warning in data["warnings"])

@@ -22,8 +22,9 @@ import numpy as np
 from fieldfuse.camera import Array, Intrinsics
 from fieldfuse.capture.poses import rigid
 from fieldfuse.errors import FieldfuseError, InputError
-from fieldfuse.evaluation.pictures import depth_picture, depth_range, spread
+from fieldfuse.evaluation.pictures import depth_picture, depth_range
 from fieldfuse.export.cameras import transforms
+from fieldfuse.export.surface import spread
 from fieldfuse.files import write_json
 from fieldfuse.pipelines.prepare import Prepared
 from fieldfuse.pipelines.render_path import read_cameras

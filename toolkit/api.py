@@ -180,8 +180,7 @@ def evaluate(result: Field | Surface, scene: Scene, *, progress: Listener = None
     Raises:
         Interrupted: the listener asked to stop.
     """
-    from fieldfuse.evaluation.baseline import nearest_image_scores
-    from fieldfuse.evaluation.score import score_views
+    from fieldfuse.evaluation.score import nearest_image_scores, score_views
 
     listener, views, indices = listening(progress, "evaluate"), scene.views, np.flatnonzero(scene.views.test)
     onto = result.working_from_input.after(scene.working_from_input.inverse())  # the same, unless it was made from another scene

@@ -218,7 +218,7 @@ class Surface(Renderable):
 
     @property
     def mesh(self) -> Mesh:
-        from fieldfuse.export.field_surface import whole_mesh
+        from fieldfuse.export.surface import whole_mesh
 
         made = whole_mesh(self.volume, self.smooth).transformed(self.working_from_input.inverse())
         return Mesh(made.vertices, made.triangles, exposed(made.colours, self.exposure), made.normals)
@@ -271,7 +271,7 @@ class Field(Renderable):
         Raises:
             InputError: it was opened without its scene, or has no surface.
         """
-        from fieldfuse.export.field_surface import Originals, surface_of_field
+        from fieldfuse.export.surface import Originals, surface_of_field
 
         if self.scene is None:
             raise InputError("a surface is made at the training cameras, and this field has no scene; use Field.open(path, scene)")

@@ -278,7 +278,7 @@ FAULTS = (
     ),
     # Evaluation
     fault("PSNR in half decibels", "wrong constant", ("float(-10 * np.log10(error))", "float(-20 * np.log10(error))")),
-    fault("SSIM's covariance", "skipped step", ("covariance = mean(first * second) - m1 * m2", "covariance = mean(first * second)")),
+    fault("SSIM's covariance", "skipped step", ("(first * second) - m1 * m2", "(first * second)")),
     fault(
         "F-score as the arithmetic mean",
         "wrong constant",
@@ -291,6 +291,7 @@ FAULTS = (
             "if not front or better(point.mean[measure], front[-1].mean[measure]):",
             "if not front or better(front[-1].mean[measure], point.mean[measure]):",
         ),
+        ("sign * point.mean[measure] > sign * front[-1]", "sign * point.mean[measure] < sign * front[-1]"),
     ),
     # Simulation
     fault(

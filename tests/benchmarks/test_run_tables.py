@@ -9,7 +9,7 @@ import pytest
 
 from benchmarks.run_tables import budget_table, run_table
 from benchmarks.table import sections
-from fieldfuse.evaluation.tradeoff_page import tradeoff_data
+from fieldfuse.evaluation.tradeoff import tradeoff_data
 from fieldfuse.files import write_json
 from tests.evaluation.test_tradeoff import ladder
 from tests.pipelines.made import bench

@@ -11,9 +11,10 @@ import pytest
 from benchmarks import speed_cases
 from benchmarks.speed import fit_curves, table, tsdf_frames
 from benchmarks.timing import Case, Timed, exponent
+from fieldfuse.camera import pixel_grid, rays
 from fieldfuse.evaluation.sphere import CHANNELS, around, lens, sphere_field, sphere_pixels
 from fieldfuse.render.bake import bake
-from fieldfuse.render.bake_image import BakedRenderer
+from fieldfuse.render.march import march
 from fieldfuse.training.numba_engine import NumbaEngine
 from tests.pipelines.made import bench
 
@@ -38,12 +39,12 @@ def test_a_ray_looks_up_and_touches_a_bounded_number_of_rows() -> None:
 
 
 def test_empty_space_is_skipped_and_light_that_is_spent_ends_a_ray() -> None:
-    field = bake(sphere_field(128))
-    work = BakedRenderer(field, 1).render_counted(lens(48, 48), around()[1])[1]
-    assert work.walked / work.rays < 60  # of about 150 fine steps through the lattice
-    assert 2 < work.coloured / work.rays <= work.looked_up / work.rays < 20
-    everything = BakedRenderer(field, 1, stop=0.0, threshold=0.0).render_counted(lens(48, 48), around()[1])[1]
-    assert everything.looked_up > 1.1 * work.looked_up and everything.coloured == everything.looked_up
+    field = sphere_field(64)
+    origins, directions, _ = rays(lens(32, 32), around()[1], pixel_grid(32, 32))
+    samples = march(field.grid, origins, directions, field.near, field.fine)
+    assert len(samples) / len(origins) < 30  # of about 150 fine steps through the lattice: the rest is empty
+    engine = NumbaEngine(field, sphere_pixels(48), threads=1)
+    assert speed_cases.step_counts(engine)["looked_up_a_ray"] < 0.8 * len(samples) / len(origins)
 
 
 def test_memory_a_voxel() -> None:

@@ -12,8 +12,7 @@ import pytest
 
 from fieldfuse.camera import Intrinsics, project
 from fieldfuse.capture import open_capture
-from fieldfuse.capture.colmap import candidate_capture, candidate_models, read_colmap
-from fieldfuse.capture.colmap_model import MODELS, intrinsics_of, read_model
+from fieldfuse.capture.colmap import MODELS, candidate_capture, candidate_models, intrinsics_of, read_colmap, read_model
 from fieldfuse.errors import InputError
 from tests.capture.layouts import OFF_CENTRE, POINTS, half_size, write_colmap_bin, write_colmap_txt
 from tests.capture.made import eyes, pixel_error, render, save_picture

@@ -14,8 +14,8 @@ from fieldfuse.errors import InputError
 from fieldfuse.evaluation.compare import compare_data, table
 from fieldfuse.evaluation.compare_meshes import MeshPictures
 from fieldfuse.evaluation.compare_page import write_comparison
-from fieldfuse.evaluation.compare_text import comparison_text
 from fieldfuse.evaluation.pictures import Pictures, Tiles, ViewPictures
+from fieldfuse.evaluation.terminal import comparison_text
 from tests.evaluation.browser import embedded_pictures, open_page
 
 SCORE = {"psnr": 25.0, "ssim": 0.8, "lpips": 0.2, "seconds_per_view": 0.5, "coverage": None, "on": {}, "depth_scale": 1.5, "abs_err": 0.02}

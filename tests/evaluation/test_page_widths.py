@@ -7,8 +7,8 @@ from pathlib import Path
 
 from fieldfuse.evaluation.compare_page import write_comparison
 from fieldfuse.evaluation.report import write_report
-from fieldfuse.evaluation.tradeoff import points_of
-from fieldfuse.evaluation.tradeoff_page import render_tradeoff, tradeoff_data
+from fieldfuse.evaluation.tradeoff import points_of, tradeoff_data
+from fieldfuse.evaluation.tradeoff_page import render_tradeoff
 from tests.evaluation.driven import Driven, driven, until
 from tests.evaluation.test_compare_page import made, pictures
 from tests.evaluation.test_report import sample

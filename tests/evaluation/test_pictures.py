@@ -17,8 +17,8 @@ from fieldfuse.evaluation.pictures import (
     error_picture,
     method_pictures,
     moving_pictures,
-    spread,
 )
+from fieldfuse.export.surface import spread
 from fieldfuse.stereo.transients import LeftOut
 from tests.evaluation.samples import draw, make_views
 

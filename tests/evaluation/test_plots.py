@@ -6,9 +6,8 @@ import re
 from xml.etree import ElementTree
 
 import pytest
-from matplotlib.figure import Figure
 
-from fieldfuse.evaluation.plots import CSS, bar_label, label_places, psnr_over_time, stage_bars
+from fieldfuse.evaluation.plots import CSS, psnr_over_time, stage_bars
 
 TIMELINE = [{"seconds": 1.0, "psnr": 15.0}, {"seconds": 10.0, "psnr": 24.0}, {"seconds": 5.0, "psnr": 21.0}]
 STAGES = [
@@ -42,17 +41,6 @@ def test_psnr_over_time() -> None:
     assert CSS["#040404"] in svg
 
 
-def test_names_of_levels_keep_clear_of_the_curve_and_of_each_other() -> None:
-    def places(levels: list[float]) -> list[tuple[bool, bool]]:
-        axes = Figure().add_subplot()
-        axes.set(xlim=(0, 10), ylim=(10, 30))
-        return label_places([2.0, 5.0, 10.0], [15.0, 21.0, 24.0], levels, axes)
-
-    assert places([13.0]) == [(True, True)]  # at the right end, above its line
-    assert places([23.0]) == [(False, True)]  # the curve ends there
-    assert places([12.5, 12.0]) == [(True, True), (True, False)]  # one above both lines, one below
-
-
 @pytest.mark.parametrize("timeline", [[], TIMELINE[:1], [*TIMELINE[:1], {"seconds": 3.0, "psnr": None}, {"seconds": None, "psnr": 2.0}]])
 def test_too_few_points(timeline: list[dict[str, float | None]]) -> None:
     assert psnr_over_time(timeline) is None
@@ -64,7 +52,6 @@ def test_stage_bars() -> None:
     check_svg(svg)
     assert {"poses", "field", "20 s, 900 MB, reused", "1 min"} <= set(texts(svg))
     assert stage_bars([]) is None and stage_bars([{"name": "x", "seconds": None}]) is None
-    assert bar_label({"seconds": 0.0}) == "0 ms"
 
 
 @pytest.mark.parametrize("name", ["<script>a</script>", "a & b", "$x^2$", "$\\frac$", "50%", '"quoted"', "名前", ""])

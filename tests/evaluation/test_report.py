@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import base64
 import json
 import re
 from copy import deepcopy
@@ -11,7 +10,6 @@ from html.parser import HTMLParser
 from pathlib import Path
 from typing import Any
 
-import cv2
 import numpy as np
 import pytest
 from hypothesis import given, settings
@@ -19,12 +17,12 @@ from hypothesis import strategies as st
 
 from fieldfuse import __version__
 from fieldfuse.errors import InputError, OutputError
-from fieldfuse.evaluation.baseline import nearest_image_scores
-from fieldfuse.evaluation.page import render_page
 from fieldfuse.evaluation.pictures import Pictures, method_pictures
 from fieldfuse.evaluation.report import CAPTURE, FIELD, POINT, POSES, SCORE, SFM_NOTE, STAGE, plain, report_data, write_report
-from fieldfuse.evaluation.score import score_views
-from fieldfuse.evaluation.table import table
+from fieldfuse.evaluation.report_page import render_page
+from fieldfuse.evaluation.score import nearest_image_scores, score_views
+from fieldfuse.evaluation.terminal import report_text
+from tests.evaluation.browser import embedded_pictures
 from tests.evaluation.samples import draw, make_views
 
 NASTY = '<script>alert("x")</script><img src=x onerror=alert(1)>&"\'{{ 7 * 7 }}{% raw %}'
@@ -112,48 +110,42 @@ def check_page(text: str) -> Page:
     return page
 
 
-def test_json_keys(tmp_path: Path) -> None:
+def test_the_form_of_the_json_is_fixed(tmp_path: Path) -> None:
     data, pictures = sample()
     json_path, html_path = write_report(tmp_path, data, pictures)
     assert json_path == tmp_path / "report.json" and html_path == tmp_path / "report.html"
     found = json.loads(json_path.read_text(encoding="utf-8"), parse_constant=lambda name: pytest.fail(f"{name} in JSON"))
     assert set(CAPTURE) <= set(found["capture"]) and set(POSES) <= set(found["poses"]) and set(FIELD) <= set(found["field"])
     assert all(set(STAGE) <= set(stage) for stage in found["stages"]) and all(set(POINT) <= set(point) for point in found["timeline"])
-    for method in ("field", "tsdf"):
-        assert set(SCORE) <= set(found["evaluation"][method])
-        assert found["evaluation"][method]["views"] == 5
+    assert all(set(SCORE) <= set(found["evaluation"][name]) and found["evaluation"][name]["views"] == 5 for name in ("field", "tsdf"))
     assert found["evaluation"]["nearest_image"]["psnr"] > 0 and "baseline" not in found
     assert found["seconds_total"] == 372 and found["version"] == __version__ and found["command"].startswith("fieldfuse run")
     assert found["stages"][0] == {"name": "field", "seconds": 3.5, "peak_memory_mb": 812, "cached": False}
     assert sorted(path.name for path in tmp_path.iterdir()) == ["report.html", "report.json"]
+    once = report_data(data)
+    assert report_data(once) == once
+    assert plain({1: (Path("a"), {"b"}, np.arange(2), True)}) == {"1": ["a", ["b"], [0, 1], True]}
 
 
-def test_keys_are_there_when_nothing_is_known(tmp_path: Path) -> None:
+def test_what_is_not_known_is_null(tmp_path: Path) -> None:
     json_path, html_path = write_report(tmp_path, {})
     found = json.loads(json_path.read_text())
     assert found["capture"] == dict.fromkeys(CAPTURE) and found["field"] == dict.fromkeys(FIELD) and found["poses"] == dict.fromkeys(POSES)
     assert found["evaluation"] == {"field": None, "tsdf": None, "nearest_image": None}
     assert found["timeline"] == found["stages"] == found["warnings"] == []
     check_page(html_path.read_text(encoding="utf-8"))
-
-
-def test_not_finite_becomes_null(tmp_path: Path) -> None:
     data = {"seconds_total": float("nan"), "field": {"voxel_size": np.float32("inf")}, "extra": {"array": np.array([1.0, np.nan])}}
     found = json.loads(write_report(tmp_path, data)[0].read_text())
     assert found["seconds_total"] is None and found["field"]["voxel_size"] is None and found["extra"]["array"] == [1.0, None]
-
-
-def test_form_is_stable() -> None:
-    data, _ = sample()
-    once = report_data(data)
-    assert report_data(once) == once
-    assert plain({1: (Path("a"), {"b"}, np.arange(2), True)}) == {"1": ["a", ["b"], [0, 1], True]}
 
 
 @pytest.mark.parametrize("broken", [{"capture": [1]}, {"stages": {"a": 1}}, {"stages": ["a"]}, {"evaluation": {"field": 3}}])
 def test_wrong_form_is_refused(tmp_path: Path, broken: dict[str, Any]) -> None:
     with pytest.raises(InputError, match="report's part"):
         write_report(tmp_path, broken)
+    (tmp_path / "file").write_text("in the way")
+    with pytest.raises(OutputError, match="cannot write"):
+        write_report(tmp_path / "file", {})
 
 
 def test_page_shows_what_counts(tmp_path: Path) -> None:
@@ -197,18 +189,6 @@ def test_title_is_the_captures_name(source: str | None, title: str) -> None:
     assert source is None or source in page.text
 
 
-def test_embedded_pictures_decode() -> None:
-    data, pictures = sample()
-    page = check_page(render_page(report_data(data), pictures))
-    sources = [attributes["src"] or "" for tag, attributes in page.tags if tag == "img"]
-    assert len(sources) == 5 * 2 * 4 + 2  # five views, two methods, four tiles, two colour bars
-    for source in sources:
-        head, _, body = source.partition(",")
-        assert head in ("data:image/jpeg;base64", "data:image/png;base64")
-        decoded = cv2.imdecode(np.frombuffer(base64.b64decode(body, validate=True), np.uint8), cv2.IMREAD_COLOR)
-        assert decoded is not None and decoded.size > 0
-
-
 def test_field_alone_and_surface_alone() -> None:
     data, pictures = sample(tsdf=False)
     page = check_page(render_page(report_data(data), pictures))
@@ -228,7 +208,7 @@ def test_a_column_of_depth_is_shown_where_there_is_depth() -> None:
             for score in (data["evaluation"]["field"], data["evaluation"]["tsdf"]):
                 score["depth_abs_err"] = None
         page = render_page(report_data(data), pictures)
-        assert ("Depth error" in page) is depth and ("depth error" in table(data)) is depth
+        assert ("Depth error" in page) is depth and ("depth error" in report_text(data)) is depth
         body = page[page.index("<h2>Quality on test views") :]
         rows = re.findall(r"<tr.*?</tr>", body[: body.index("</table>")], re.DOTALL)
         assert len(rows) > 3 and {len(re.findall(r"<t[hd][ >]", row)) for row in rows} == {6 if depth else 5}
@@ -285,37 +265,29 @@ def test_any_settings_make_a_page(value: Any) -> None:
     check_page(render_page(report_data({"settings": {"group": value}, "other": value}), Pictures()))
 
 
-def test_pictures_keep_the_page_small(tmp_path: Path) -> None:
+def test_embedded_pictures_are_whole_and_small(tmp_path: Path) -> None:
+    data, pictures = sample()
+    shown = embedded_pictures(render_page(report_data(data), pictures))
+    assert len(shown) == 5 * 2 * 4 + 2  # five views, two methods, four tiles, two colour bars
+    assert all(picture is not None for picture in shown)
     views = make_views(count=8, height=720, width=1280, every=2)
     indices = np.flatnonzero(views.test)
-    pictures = method_pictures(views, indices, {"field": [draw(views, i) for i in indices]})
-    page = write_report(tmp_path, {}, pictures)[1]
+    page = write_report(tmp_path, {}, method_pictures(views, indices, {"field": [draw(views, i) for i in indices]}))[1]
     assert page.stat().st_size < 2_500_000
-    source = next(
-        attributes["src"]
-        for tag, attributes in Page(page.read_text(encoding="utf-8")).tags
-        if tag == "img" and "Photo" in str(attributes["alt"])
-    )
-    decoded = cv2.imdecode(np.frombuffer(base64.b64decode(str(source).partition(",")[2]), np.uint8), cv2.IMREAD_COLOR)
-    assert decoded is not None and decoded.shape[:2] == (270, 480)
-
-
-def test_unwritable_folder(tmp_path: Path) -> None:
-    (tmp_path / "file").write_text("in the way")
-    with pytest.raises(OutputError, match="cannot write"):
-        write_report(tmp_path / "file", {})
+    sizes = {picture.shape[:2] for picture in embedded_pictures(page.read_text(encoding="utf-8")) if picture is not None}
+    assert sizes == {(270, 480), (1, 128)}  # and the colour bars
 
 
 def test_table_for_the_terminal() -> None:
     data, _ = sample()
-    text = table(data)
+    text = report_text(data)
     rows = {line.split("  ")[1].strip() if line.startswith("  ") else line: line for line in text.splitlines() if line}
-    assert f"{data['evaluation']['field']['psnr']:.2f}" in rows["field"] and "0.4 s" in rows["field"]
+    assert f"{data['evaluation']['field']['psnr']:.2f}" in rows["Field"] and "0.4 s" in rows["Field"]
     assert f"{data['evaluation']['tsdf']['ssim']:.3f}" in rows["TSDF"]
-    assert "nearest training picture" in text and "50.0% of the pixels" in text
+    assert "Nearest training photo" in text and "50.0% of the pixels" in text
     assert "13 frames, 12 of 13 with a pose" in text and "6 min 12 s in all" in text
     assert max(map(len, text.splitlines())) <= 100
-    assert table(report_data(data)) == text
+    assert report_text(report_data(data)) == text
 
 
 def test_no_number_is_cut_off_in_the_terminal() -> None:
@@ -323,12 +295,12 @@ def test_no_number_is_cut_off_in_the_terminal() -> None:
     data["scene"]["metric"] = False
     data["evaluation"]["network"] = {**data["evaluation"]["field"], "key_frames": 12, "seconds": 191.0}
     for width in (60, 80, 100):
-        text = table(data, width)
+        text = report_text(data, width)
         assert "…" not in text and max(map(len, text.splitlines())) <= width
         assert text.count(f"{data['evaluation']['field']['psnr']:.2f}") >= 2 and "12 key" in text
 
 
 def test_table_without_scores_is_the_facts() -> None:
-    assert table({}) == ""
+    assert report_text({}) == ""
     data = {"capture": {"frames": 50}, "poses": {"registered": 48, "total": 50}, "exports": "run/exports/cameras"}
-    assert table(data) == "50 frames, 48 of 50 with a pose\n"
+    assert report_text(data) == "50 frames, 48 of 50 with a pose\n"

@@ -2,62 +2,29 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+from typing import Any
+
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
 from fieldfuse.evaluation import words
 
-
-@pytest.mark.parametrize(
-    ("seconds", "shown"),
-    [
-        (0, "0 ms"),
-        (0.012, "12 ms"),
-        (0.0996, "0.1 s"),
-        (4.24, "4.2 s"),
-        (9.96, "10 s"),
-        (59.7, "1 min"),
-        (372, "6 min 12 s"),
-        (3599.8, "1 h"),
-        (7322, "2 h 2 min"),
-    ],
-)
-def test_duration(seconds: float, shown: str) -> None:
-    assert words.duration(seconds) == shown
+SHOWN: dict[Callable[..., str], dict[Any, str]] = {
+    words.duration: {0: "0 ms", 0.012: "12 ms", 0.0996: "0.1 s", 4.24: "4.2 s", 9.96: "10 s", 59.7: "1 min", 372: "6 min 12 s"}
+    | {3599.8: "1 h", 7322: "2 h 2 min"},
+    words.size: {0: "0 bytes", 999: "999 bytes", 999.6: "1.0 kB", 3456789: "3.5 MB", 99.7e6: "100 MB", 999.7e6: "1.0 GB", 5e12: "5000 GB"},
+    lambda count: words.counted(count, "key frame"): {0: "0 key frames", 1: "1 key frame", 1234: "1,234 key frames"},
+    words.memory: {1840.5: "1.8 GB", 210: "210 MB"},
+    words.share: {0.8512: "85.1%"},
+    words.significant: {0.0: "0", 0.00781: "0.00781", 0.0000123: "1.23e-05", 12.345: "12.3", 1234.5: "1,234", -0.5: "-0.5"},
+}
 
 
-@pytest.mark.parametrize(
-    ("count", "shown"),
-    [
-        (0, "0 bytes"),
-        (999, "999 bytes"),
-        (999.6, "1.0 kB"),
-        (3456789, "3.5 MB"),
-        (99.7e6, "100 MB"),
-        (999.7e6, "1.0 GB"),
-        (5e12, "5000 GB"),
-    ],
-)
-def test_size(count: float, shown: str) -> None:
-    assert words.size(count) == shown
-
-
-@pytest.mark.parametrize(("count", "shown"), [(0, "0 key frames"), (1, "1 key frame"), (1234, "1,234 key frames")])
-def test_counted(count: int, shown: str) -> None:
-    assert words.counted(count, "key frame") == shown
-
-
-def test_memory_and_share() -> None:
-    assert words.memory(1840.5) == "1.8 GB" and words.memory(210) == "210 MB"
-    assert words.share(0.8512) == "85.1%"
-
-
-@pytest.mark.parametrize(
-    ("value", "shown"), [(0.0, "0"), (0.00781, "0.00781"), (0.0000123, "1.23e-05"), (12.345, "12.3"), (1234.5, "1,234"), (-0.5, "-0.5")]
-)
-def test_significant(value: float, shown: str) -> None:
-    assert words.significant(value) == shown
+@pytest.mark.parametrize(("show", "values"), SHOWN.items())
+def test_numbers(show: Callable[..., str], values: dict[Any, str]) -> None:
+    assert {value: show(value) for value in values} == values
 
 
 def test_none_is_a_dash() -> None:

@@ -10,23 +10,25 @@ import pytest
 from fieldfuse.camera import Array, Intrinsics
 from fieldfuse.errors import InputError
 from fieldfuse.export.mesh import mesh_facts
-from fieldfuse.export.surface import field_volume, reliable_depth
+from fieldfuse.export.surface import Refinement, field_volume, reliable_depth
 from fieldfuse.render.image import Rendered
 from tests.tsdf.scenes import CAMERA, all_round, sphere_colour, sphere_depth, sphere_frame
 
 CENTRE = np.array([0.2, 0.1, -0.1])
 RADIUS = 0.5
 POSES = all_round(CENTRE, 1.6, 32)
+CAMERAS = [CAMERA] * len(POSES)
 
 
-def exact(camera: Intrinsics, pose: Array) -> tuple[Array, Array, Array]:
+def exact(camera: Intrinsics, pose: Array) -> Rendered:
     frame = sphere_frame(pose, CENTRE, RADIUS, camera)
-    return frame.colour.astype(np.float32) / 255, frame.depth, (frame.depth > 0).astype(np.float32)
+    return Rendered(frame.colour.astype(np.float32) / 255, frame.depth, (frame.depth > 0).astype(np.float32))
 
 
-def faulty(camera: Intrinsics, pose: Array) -> tuple[Array, Array, Array]:
+def faulty(camera: Intrinsics, pose: Array) -> Rendered:
     """Silhouettes smeared to depths behind the surface, a faint fog before the sphere, a floater that a single view shows."""
-    rgb, depth, opacity = exact(camera, pose)
+    found = exact(camera, pose)
+    depth, opacity = found.depth, found.opacity
     shifted = np.roll(depth, 1, axis=1)
     smear = (depth == 0) & (shifted > 0)
     depth = np.where(smear, shifted + 0.4, depth)
@@ -34,12 +36,12 @@ def faulty(camera: Intrinsics, pose: Array) -> tuple[Array, Array, Array]:
     depth, opacity = np.where(fog, 0.8, depth).astype(np.float32), np.where(fog, 0.3, np.maximum(opacity, smear)).astype(np.float32)
     if np.allclose(pose, POSES[3]):
         depth[5:25, 5:25], opacity[5:25, 5:25] = 0.9, 1.0
-    return rgb, depth, opacity
+    return Rendered(found.rgb, depth, opacity)
 
 
 @pytest.mark.parametrize("render", [exact, faulty])
-def test_the_mesh_is_the_sphere_and_nothing_else(render: Callable[..., tuple[Array, Array, Array]]) -> None:
-    mesh = field_volume(render, POSES, CAMERA, 0.02).mesh().cleaned(min_area_share=2e-3)
+def test_the_mesh_is_the_sphere_and_nothing_else(render: Callable[..., Rendered]) -> None:
+    mesh = field_volume(render, POSES, CAMERAS, 0.02).mesh().cleaned(min_area_share=2e-3)
     offset = mesh.vertices - CENTRE
     radius = np.linalg.norm(offset, axis=1)
     assert np.quantile(np.abs(radius - RADIUS), 0.98) < 0.01
@@ -51,8 +53,8 @@ def test_the_mesh_is_the_sphere_and_nothing_else(render: Callable[..., tuple[Arr
     assert np.median(np.abs(mesh.colours[clear].astype(int) - sphere_colour(mesh.vertices[clear], CENTRE))) <= 4
 
 
-def test_points_and_a_rendered_object() -> None:
-    cloud = field_volume(lambda camera, pose: Rendered(*exact(camera, pose)), POSES, CAMERA, 0.02).points()
+def test_points() -> None:
+    cloud = field_volume(exact, POSES, CAMERAS, 0.02).points()
     offset = cloud.points - CENTRE
     assert len(cloud.points) > 3000
     assert np.quantile(np.abs(np.linalg.norm(offset, axis=1) - RADIUS), 0.97) < 0.01
@@ -69,10 +71,10 @@ def test_sizes_are_chosen_and_one_camera_a_pose_is_fine() -> None:
 def test_what_is_rendered_may_be_smaller_than_its_depth_map() -> None:
     """Half as wide; nobody polishes, so a voxel's error is that of a coarser picture, and colours are where they belong."""
 
-    def half(camera: Intrinsics, pose: Array) -> tuple[Array, Array, Array]:
+    def half(camera: Intrinsics, pose: Array) -> Rendered:
         return exact(camera.scaled(camera.width // 2, camera.height // 2), pose)
 
-    mesh = field_volume(half, POSES, CAMERA, 0.02).mesh().cleaned(min_area_share=2e-3)
+    mesh = field_volume(half, POSES, CAMERAS, 0.02).mesh().cleaned(min_area_share=2e-3)
     offset = mesh.vertices - CENTRE
     assert np.quantile(np.abs(np.linalg.norm(offset, axis=1) - RADIUS), 0.95) < 0.012
     clear = np.abs(offset[:, 2]) > 0.04
@@ -81,7 +83,7 @@ def test_what_is_rendered_may_be_smaller_than_its_depth_map() -> None:
 
 def test_the_region_is_kept_and_the_rest_is_not() -> None:
     region = (CENTRE - 1.0, CENTRE + np.array([1, 1, 0]))  # the lower half
-    mesh = field_volume(exact, POSES, CAMERA, 0.02, region=region).mesh()
+    mesh = field_volume(exact, POSES, CAMERAS, 0.02, region=region).mesh()
     assert mesh.vertices[:, 2].max() < CENTRE[2] + 0.03
     assert mesh.vertices[:, 2].min() < CENTRE[2] - RADIUS + 0.03
 
@@ -95,14 +97,14 @@ def test_what_is_made_of_all_maps_together_is_what_is_fused() -> None:
         asked.extend(((depth > 0).sum(), (all_of_it > 0).sum()) for depth, all_of_it in zip(reliable, opaque, strict=True))
         return [np.where(np.arange(depth.shape[1]) < depth.shape[1] // 2, depth, 0).astype(np.float32) for depth in reliable]
 
-    half = field_volume(faulty, POSES[:1], CAMERA, 0.02, settle=settle, carve=False).mesh()
+    half = field_volume(faulty, POSES[:1], [CAMERA], 0.02, refinement=Refinement(settle=settle)).mesh()
     assert len(asked) == 1 and 0 < asked[0][0] < asked[0][1]
     there = (half.vertices - POSES[0][:3, 3]) @ POSES[0][:3, :3]
     assert (there[:, 0] < 0.03).all() and len(half.vertices) > 100
 
 
 def test_thinned_when_asked() -> None:
-    mesh = field_volume(exact, POSES, CAMERA, 0.02).mesh().cleaned().decimated(1500)
+    mesh = field_volume(exact, POSES, CAMERAS, 0.02).mesh().cleaned().decimated(1500)
     assert 1000 < len(mesh.triangles) <= 1500
     assert np.quantile(np.abs(np.linalg.norm(mesh.vertices - CENTRE, axis=1) - RADIUS), 0.9) < 0.02
 
@@ -127,19 +129,17 @@ def test_edges_and_faint_pixels_are_dropped_and_slopes_are_not() -> None:
 
 
 def test_what_has_no_surface_is_refused() -> None:
-    def nothing(camera: Intrinsics, pose: Array) -> tuple[Array, Array, Array]:
-        rgb, depth, _ = exact(camera, pose)
-        return rgb, depth, np.zeros_like(depth)
+    def nothing(camera: Intrinsics, pose: Array) -> Rendered:
+        found = exact(camera, pose)
+        return Rendered(found.rgb, found.depth, np.zeros_like(found.depth))
 
     with pytest.raises(InputError, match="no rendered view shows a surface"):
-        field_volume(nothing, POSES[:3], CAMERA, 0.02)
+        field_volume(nothing, POSES[:3], CAMERAS[:3], 0.02)
     with pytest.raises(InputError, match="2 cameras and 3 poses"):
         field_volume(exact, POSES[:3], [CAMERA] * 2, 0.02)
-    with pytest.raises(InputError, match="nearer than"):
-        field_volume(exact, POSES[:3], CAMERA, 0.02, depth_max=0.5)
     with pytest.raises(InputError, match="finer than the pixels"):
-        field_volume(exact, POSES, CAMERA, 1e-4)
+        field_volume(exact, POSES, CAMERAS, 1e-4)
 
 
 def test_depth_of_the_scene_is_what_the_renderer_says() -> None:
-    assert exact(CAMERA, POSES[0])[1] == pytest.approx(sphere_depth(CAMERA, POSES[0], CENTRE, RADIUS))
+    assert exact(CAMERA, POSES[0]).depth == pytest.approx(sphere_depth(CAMERA, POSES[0], CENTRE, RADIUS))

@@ -16,8 +16,7 @@ from fieldfuse.camera import Array, Intrinsics, project
 from fieldfuse.errors import InputError
 from fieldfuse.export.atlas import GUTTER, Atlas, make_atlas
 from fieldfuse.export.mesh import write_textured
-from fieldfuse.export.sighted import BEST, picture_weights, strongest
-from fieldfuse.export.texture import textured
+from fieldfuse.export.texture import BEST, Photos, strongest, textured, vertex_visibility
 from fieldfuse.render.paths import look_at
 from fieldfuse.tsdf.mesh import Mesh
 from tests.export.samples import coloured_ball, turned
@@ -96,8 +95,8 @@ def test_what_does_not_fit_is_refused() -> None:
 def test_a_texture_shows_what_the_picture_shows() -> None:
     picture = waves(CAMERA, 0.0)
     mesh = painted(board(), picture, FRONT[0])
-    atlas, texture = textured(mesh, [picture], [CAMERA], FRONT)
-    whole = (picture_weights(mesh, [CAMERA], FRONT)[mesh.triangles, 0] > 0).all(axis=1)
+    atlas, texture = textured(mesh, Photos([picture], [CAMERA], FRONT))
+    whole = (vertex_visibility(mesh, Photos([], [CAMERA], FRONT))[mesh.triangles, 0] > 0).all(axis=1)
     for shares in ([1 / 3, 1 / 3, 1 / 3], [0.5, 0.5, 0.0], [0.0, 0.5, 0.5], [0.9, 0.05, 0.05]):
         points = np.einsum("tki,k->ti", mesh.vertices[mesh.triangles], np.array(shares))
         place, _ = project(CAMERA, FRONT[0], points)
@@ -111,8 +110,8 @@ def test_colours_are_the_vertices_in_the_large_and_the_pictures_in_the_small() -
     v, u = np.mgrid[:72, :96]
     dots = np.repeat((100 + 40 + 50 * ((u // 2 + v // 2) % 2 * 2.0 - 1))[..., None], 3, axis=2).astype(np.uint8)
     mesh = replace(board(), colours=np.full((169, 3), 100, np.uint8))
-    atlas, texture = textured(mesh, [dots], [CAMERA], FRONT)
-    whole = (picture_weights(mesh, [CAMERA], FRONT)[mesh.triangles, 0] > 0).all(axis=1)
+    atlas, texture = textured(mesh, Photos([dots], [CAMERA], FRONT))
+    whole = (vertex_visibility(mesh, Photos([], [CAMERA], FRONT))[mesh.triangles, 0] > 0).all(axis=1)
     seen = painted_texels(texture, atlas, np.flatnonzero(whole))
     assert seen.mean() == pytest.approx(100, abs=6)
     assert seen.std() > 25
@@ -124,7 +123,7 @@ def test_pictures_take_over_from_each_other_smoothly() -> None:
     pictures = [np.full((72, 96, 3), value, np.uint8) for value in (40, 220, 128, 128)]
     mesh = board(cells=40)
     mesh = replace(mesh, colours=np.repeat(130 + 90 * np.tanh(3 * mesh.vertices[:, :1]), 3, axis=1).astype(np.uint8))
-    atlas, texture = textured(mesh, pictures, [CAMERA] * 4, poses)
+    atlas, texture = textured(mesh, Photos(pictures, [CAMERA] * 4, poses))
     middle = mesh.vertices[mesh.triangles].mean(axis=1)
     colour = looked_up(texture, atlas, np.full(3, 1 / 3))[:, 0].astype(float)
     near = np.abs(middle[:, 1]) < 0.2
@@ -143,20 +142,20 @@ def test_what_is_hidden_is_not_painted_on_what_is_behind() -> None:
         np.concatenate([np.tile([0.0, 0, 1], (len(front.vertices), 1)), np.tile([0.0, 0, 1], (len(back.vertices), 1))]),
     )
     pose = look_at(np.array([[0.0, 0.0, 3.0]]), np.zeros(3), np.array([0.0, 1, 0]))
-    weight = picture_weights(both, [CAMERA], pose)[:, 0]
+    weight = vertex_visibility(both, Photos([], [CAMERA], pose))[:, 0]
     own, behind = weight[: len(front.vertices)], weight[len(front.vertices) :]
     shade = np.abs(back.vertices[:, :2]).max(axis=1)
     assert (behind[shade < 0.35] == 0).all()  # a third wider than what hides it, seen from three units away
     assert (behind[(shade > 0.6) & (shade < 0.8)] > 0).all()
     assert own[(np.abs(front.vertices[:, :2]) < 0.2).all(axis=1)].min() > 0
     away = look_at(np.array([[0.0, 0.0, -3.0]]), np.zeros(3), np.array([0.0, 1, 0]))
-    assert (picture_weights(both, [CAMERA], away)[:, 0] == 0).all()  # from behind nothing is seen
+    assert (vertex_visibility(both, Photos([], [CAMERA], away))[:, 0] == 0).all()  # from behind nothing is seen
 
 
 def test_what_is_masked_is_not_looked_at_and_blurred_pictures_count_less() -> None:
     mesh = replace(board(), colours=np.full((169, 3), 50, np.uint8))
     left = np.arange(96)[None] < 48 + np.zeros((72, 1), int)
-    weight = picture_weights(mesh, [CAMERA], FRONT, [left])[:, 0]
+    weight = vertex_visibility(mesh, Photos([], [CAMERA], FRONT, [left]))[:, 0]
     place, _ = project(CAMERA, FRONT[0], mesh.vertices)
     assert (weight[place[:, 0] > 48] == 0).all() and weight[(place[:, 0] > 20) & (place[:, 0] < 40)].max() > 0
     # The same camera twice, once blurred (all grey): lines stay lines.
@@ -165,7 +164,7 @@ def test_what_is_masked_is_not_looked_at_and_blurred_pictures_count_less() -> No
     poses = np.concatenate([FRONT, FRONT])
     spread = []
     for worth in ((1.0, 1.0), (1.0, 0.05)):
-        atlas, texture = textured(mesh, [lines, blurred], [CAMERA] * 2, poses, worth=worth)
+        atlas, texture = textured(mesh, Photos([lines, blurred], [CAMERA] * 2, poses, worth=worth))
         spread.append(painted_texels(texture, atlas, np.arange(len(mesh.triangles))).std())
     assert spread[1] > 1.5 * spread[0]
 
@@ -182,7 +181,7 @@ def test_the_best_pictures_count() -> None:
 
 def test_the_file_shows_it_in_the_inputs_frame(tmp_path: Path) -> None:
     mesh, similarity = board(), turned()
-    atlas, texture = textured(mesh, [waves(CAMERA, 1.0)], [CAMERA], FRONT)
+    atlas, texture = textured(mesh, Photos([waves(CAMERA, 1.0)], [CAMERA], FRONT))
     path = tmp_path / "textured.glb"
     write_textured(path, mesh, atlas, texture, similarity)
     assert [item.name for item in tmp_path.iterdir()] == [path.name]

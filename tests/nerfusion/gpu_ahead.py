@@ -138,7 +138,7 @@ def corners(views: int, side: int, planes: int) -> None:
         found = torch.full((1 + 2 * 512 // local_volume.PART,), 3, dtype=torch.int32)  # as if all corners had been found
         found[0] = planes
         for wanted in (None, torch.ones(2 * 512, dtype=torch.bool)):
-            with mock.patch.object(local_volume.torch, "zeros", lambda *_, found=found, **__: found), torch.no_grad():
+            with mock.patch("torch.zeros", lambda *_, found=found, **__: found), torch.no_grad():
                 local_volume.local_volume(model.local, frame, space, topology, wanted, numbers)
     step = torch.rand(planes)
     for table in (True, False):

@@ -16,7 +16,7 @@ from fieldfuse.errors import InputError
 from fieldfuse.evaluation.compare_truth import GroundTruth
 from fieldfuse.export.mesh import write_mesh
 from fieldfuse.files import read_json, write_json
-from fieldfuse.pipelines.steps_compare import choose_surfaces
+from fieldfuse.pipelines.comparison import choose_surfaces
 from fieldfuse.tsdf.mesh import Mesh
 from tests.evaluation.browser import embedded_pictures, open_page
 from tests.pipelines.made import bench, call
@@ -61,7 +61,7 @@ def compared(tmp_path_factory: pytest.TempPathFactory) -> Path:
     folder = tmp_path_factory.mktemp("compare")
     make_corner(folder / "corner", depth=True)
     add_truth(folder / "corner")
-    from fieldfuse.pipelines.compare import compare_run
+    from fieldfuse.pipelines.comparison import compare_run
     from fieldfuse.pipelines.console import make_progress
     from fieldfuse.pipelines.options import Place, gather
 

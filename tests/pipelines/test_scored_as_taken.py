@@ -16,9 +16,9 @@ from typer.testing import CliRunner
 from fieldfuse.camera import Similarity
 from fieldfuse.capture.storage import load_views
 from fieldfuse.capture.types import Views
-from fieldfuse.evaluation.baseline import nearest_image_scores
 from fieldfuse.evaluation.geometry import read_mesh
-from fieldfuse.evaluation.images import psnr
+from fieldfuse.evaluation.metrics import psnr
+from fieldfuse.evaluation.score import nearest_image_scores
 from fieldfuse.evaluation.sphere import around
 from fieldfuse.evaluation.sphere import lens as around_lens
 from fieldfuse.files import read_json

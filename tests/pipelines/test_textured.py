@@ -12,7 +12,7 @@ import trimesh
 
 from fieldfuse.effects.correct import Corrections
 from fieldfuse.errors import InputError
-from fieldfuse.export.field_surface import Originals
+from fieldfuse.export.surface import Originals
 from fieldfuse.files import read_json
 from fieldfuse.pipelines.console import make_progress
 from fieldfuse.pipelines.job import open_job

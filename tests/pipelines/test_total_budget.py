@@ -143,6 +143,7 @@ def test_what_looking_for_effects_teaches(tmp_path: Path, corrected: bool, real:
     """One second is predicted for the first look, at ten pictures, and four for all looks."""
     plan = TotalBudget(60)
     feature = 0.1 / model.COST["effects"][1]
+    plan.choice = model.Choice(640)
     plan.speed = model.Speed({"decode": 1.0, "features": feature, "ray": 1.0, "fit": 1.0, "score": 1.0})
     plan.work = model.Work(30, 640, 480, 20, posed=True, depth=False, outlined=True)
     (tmp_path / "effects.json").write_text(json.dumps({"corrections": {"poses": [1] if corrected else []}}))

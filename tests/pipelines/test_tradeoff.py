@@ -11,12 +11,10 @@ from fieldfuse.config import Settings
 from fieldfuse.errors import InputError
 from fieldfuse.evaluation.tradeoff import MEASURES, checked_row, points_of, series
 from fieldfuse.files import read_json, write_json
-from fieldfuse.pipelines import tradeoff_child
+from fieldfuse.pipelines import tradeoff_point
 from fieldfuse.pipelines.direct_field import direct_field
 from fieldfuse.pipelines.job import Job
-from fieldfuse.pipelines.tradeoff import unbounded
-from fieldfuse.pipelines.tradeoff_plan import base_time, chosen_axes, chosen_times, plan
-from fieldfuse.pipelines.tradeoff_sweep import run_child
+from fieldfuse.pipelines.tradeoff_sweep import chosen_axes, chosen_times, plan, run_child, unbounded
 from fieldfuse.progress import SILENT
 from tests.pipelines.made import call
 from tests.pipelines.test_matched import make_corner
@@ -47,7 +45,7 @@ def test_only_what_is_asked_for() -> None:
         "field-5s-views0.5",
     ]
     assert [one.id for one in plan(["iterations"], [3.0, 10.0], 1, None)] == ["field-10s", "field-3s"]
-    assert base_time([60.0, 120.0]) == 60 and base_time([10.0, 29.0]) == 29
+    assert plan(["views"], [60.0, 120.0], 1, None)[0].id == "field-60s" and plan(["views"], [10.0, 29.0], 1, None)[0].id == "field-29s"
 
 
 def test_direct_inference_is_a_curve_over_key_frames_and_one_over_voxels() -> None:
@@ -94,7 +92,7 @@ def test_the_command_of_a_whole_sweep_makes_it_in_one_call(typed: str, whole: st
 
 def here(_: object, ask: Path, *__: object) -> int:
     """What a point's process does, in this one."""
-    return tradeoff_child.main(str(ask))
+    return tradeoff_point.main(str(ask))
 
 
 def surfaces_here(job: Job, ask: Path, log: Path, expected: float) -> int:

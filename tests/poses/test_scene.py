@@ -288,6 +288,7 @@ def test_the_frame_of_the_cameras_is_the_same_however_the_world_lies(seed):
 def test_tight_turn_squares_a_turned_room(angle):
     grid = np.stack(np.meshgrid(np.linspace(-3, 3, 30), np.linspace(-1, 1, 12), [0.0], indexing="ij"), axis=-1).reshape(-1, 3)
     turned = grid @ turn_about_z(angle).T
+    np.testing.assert_allclose(turn_about_z(90) @ [1.0, 0, 0], [0, 1, 0], atol=1e-12)  # counter-clockwise, seen from above
     back = turned @ turn_about_z(tight_turn(turned)).T
     assert np.prod(np.ptp(back[:, :2], axis=0)) <= 12 * 1.02  # to a tenth of a degree
 

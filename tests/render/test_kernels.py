@@ -54,12 +54,10 @@ def test_distances_of_bricks_are_those_of_the_chessboard(shape: tuple[int, int, 
 
 
 @njit(**{**K.LEAF, "cache": False})
-def _all(width: Any, table: Any, rows: Any, weights: Any, steps: Any, starts: Any, mean: Any, sums: Any, out: Any) -> Any:
+def _all(width: Any, table: Any, rows: Any, weights: Any, mean: Any, sums: Any, out: Any) -> Any:
     for at in range(len(rows)):
         row.mix(width, table, rows, weights, at, out)
         row.add_to(width, mean, out, at, weights[at, 0])
-        w = weights[at]
-        row.add_mixed_bytes(width, mean, steps, starts, at, (w[0], w[1], w[2], w[3], w[4], w[5], w[6], w[7]))
     row.put_row(width, sums, np.int64(1), mean, np.float32(0.5))
     row.add_row(width, sums, np.int64(1), mean, np.float32(0.25))
     return row.product_with(width, sums, np.int64(1), mean)
@@ -70,12 +68,10 @@ def test_rows_against_numpy(channels: int) -> None:
     rng = np.random.default_rng(channels)
     table, weights = (rng.normal(size=shape).astype(np.float32) for shape in ((20, channels), (6, 8)))
     rows = rng.integers(0, 20, (6, 8), dtype=np.int32)
-    steps, starts = rng.integers(0, 256, (21, channels), dtype=np.uint8), rng.integers(0, 20, (6, 4), dtype=np.int32)
     mean, sums, out = (np.full(shape, np.float32(7)) for shape in (channels, (3, channels), (7, channels)))
-    found = _all((0,) * channels, table, rows, weights, steps, starts, mean, sums, out)
+    found = _all((0,) * channels, table, rows, weights, mean, sums, out)
     mixed = np.einsum("sk,skc->sc", weights.astype(float), table[rows])
-    pairs = np.stack([starts, starts + 1], -1).reshape(6, 8)
-    wanted = 7 + weights[:, 0].astype(float) @ mixed + np.einsum("sk,skc->c", weights.astype(float), steps[pairs])
+    wanted = 7 + weights[:, 0].astype(float) @ mixed
     np.testing.assert_allclose(out[:6], mixed, rtol=1e-5, atol=1e-5)
     np.testing.assert_allclose(mean, wanted, rtol=1e-5, atol=1e-3)
     np.testing.assert_allclose(sums[1], 0.75 * mean, rtol=1e-6)

@@ -19,7 +19,6 @@ from fieldfuse.evaluation.sphere import around, lens, sphere_field
 from fieldfuse.nerfusion.encoding import SH
 from fieldfuse.render.bake import bake
 from fieldfuse.render.bake_file import read_baked, write_baked
-from fieldfuse.render.bake_image import BakedRenderer
 from fieldfuse.render.field import Field
 from fieldfuse.render.image import render_view
 from fieldfuse.render.sky import on_sky, sky_colours
@@ -164,7 +163,7 @@ def test_pictures_of_a_field_and_of_what_is_baked_from_it_show_the_sky() -> None
     _, directions, _ = rays(camera, pose, pixel_grid(40, 30))
     np.testing.assert_allclose(shown.rgb[empty], sky_colours(sky, directions).view(30, 40, 3).numpy()[empty], atol=1e-6)
     np.testing.assert_array_equal(shown.rgb[shown.opacity > 0.999], plain.rgb[plain.opacity > 0.999])
-    baked = BakedRenderer(bake(field), 1).render(camera, pose)
+    baked = render_view(bake(field).to_field(), camera, pose)
     np.testing.assert_allclose(baked.rgb[empty], shown.rgb[empty], atol=1e-3)
     assert float(np.abs(baked.rgb - shown.rgb).mean()) < 2 / 255
 

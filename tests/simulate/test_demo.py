@@ -15,11 +15,11 @@ from fieldfuse.capture.video import read_video
 from fieldfuse.config import CaptureSettings, PosesSettings
 from fieldfuse.errors import Interrupted, OutputError
 from fieldfuse.poses.sfm import find_poses
-from fieldfuse.progress import Progress
 from fieldfuse.simulate import demo
 from fieldfuse.simulate.demo import BakedScene, Filmed, Light, demo_scene, hand_held, write_demo_video
 from fieldfuse.simulate.solids import BALL, BOX, upright
 from tests.poses.textured import aligned_error
+from tests.stereo.made import Stopping
 
 CAMERA = Intrinsics(80, 60, 70.0, 70.0, 40.0, 30.0)
 FRONT = np.array([[1, 0, 0, 0], [0, 0, 1, -3], [0, -1, 0, 0.5], [0, 0, 0, 1]], dtype=float)  # at y = −3, looking along y; z is up
@@ -85,12 +85,8 @@ def test_same_seed_same_picture(filmed: tuple[Filmed, list[Array]]) -> None:
 def test_stopping_leaves_no_file(filmed: tuple[Filmed, list[Array]], tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(demo, "demo_scene", lambda seed: filmed[0].scene)  # made once
 
-    class Stopped(Progress):
-        def stopping(self) -> bool:
-            return True
-
     with pytest.raises(Interrupted):
-        write_demo_video(tmp_path / "out.mp4", frames=3, size=(64, 48), progress=Stopped())
+        write_demo_video(tmp_path / "out.mp4", frames=3, size=(64, 48), progress=Stopping())
     assert list(tmp_path.iterdir()) == []
 
 

@@ -18,18 +18,13 @@ from fieldfuse.effects.effect_specs import PRESETS, parse, preset
 from fieldfuse.effects.models import MotionBlur, RollingShutter, decode_srgb, encode_srgb, to_bytes
 from fieldfuse.simulate.eye import take
 from fieldfuse.simulate.film import Film, FilmCamera, Shot
-from fieldfuse.simulate.materials import TextureBank, texture_bank
+from fieldfuse.simulate.materials import TextureBank
 from fieldfuse.simulate.paths import PathSettings, plan
 from fieldfuse.simulate.procedural import random_scene
 from fieldfuse.tone import share, square_radius
 
 CAMERA = Intrinsics(80, 60, 60.0, 60.0, 40.0, 30.0)
 PATH = PathSettings("walk", frames=6, fps=5.0, speed=0.6, shake=6.0)
-
-
-@pytest.fixture(scope="module")
-def bank() -> TextureBank:
-    return texture_bank(size=128)
 
 
 def filmed(bank: TextureBank, *listing: Any, kind: str = "room", depth: bool = False, seed: int = 4) -> Film:

@@ -10,14 +10,9 @@ from hypothesis import strategies as st
 from scipy.spatial.transform import Rotation
 
 from fieldfuse.errors import InputError
-from fieldfuse.simulate.materials import TextureBank, texture_bank
+from fieldfuse.simulate.materials import TextureBank
 from fieldfuse.simulate.paths import MAKERS, Motion, PathSettings, Shake, plan
 from fieldfuse.simulate.procedural import KINDS, random_scene
-
-
-@pytest.fixture(scope="module")
-def bank() -> TextureBank:
-    return texture_bank(size=128)
 
 
 def made(bank: TextureBank, scene: str, kind: str, seed: int = 0, **rest: float) -> tuple[Motion, np.ndarray, float]:

@@ -17,7 +17,7 @@ from fieldfuse.effects.effect_specs import STRENGTHS, parse, preset
 from fieldfuse.effects.scenery import EYES, Pedestrians, Walk
 from fieldfuse.simulate.eye import eye_of, take
 from fieldfuse.simulate.film import Film, FilmCamera
-from fieldfuse.simulate.materials import TextureBank, texture_bank
+from fieldfuse.simulate.materials import TextureBank
 from fieldfuse.simulate.mesh_scene import load_mesh_scene
 from fieldfuse.simulate.paths import PathSettings, plan
 from fieldfuse.simulate.people import Peopled, peopled
@@ -28,11 +28,6 @@ from tests.simulate.test_mesh_scene import wall
 from tests.simulate.test_simulate import made
 
 PATH = PathSettings("walk", frames=24, fps=3.0, speed=0.5)
-
-
-@pytest.fixture(scope="module")
-def bank() -> TextureBank:
-    return texture_bank(size=128)
 
 
 def filmed(bank: TextureBank, *listing: object, camera: Intrinsics = CAMERA) -> Film:

@@ -11,17 +11,12 @@ import torch
 from fieldfuse.camera import Array, Intrinsics, unproject
 from fieldfuse.errors import InputError
 from fieldfuse.simulate.eye import Rays
-from fieldfuse.simulate.materials import TextureBank, texture_bank
+from fieldfuse.simulate.materials import TextureBank
 from fieldfuse.simulate.procedural import KINDS, random_scene
 from fieldfuse.simulate.scene import Lamp, Scene
 from fieldfuse.simulate.solids import FAR
 
 CAMERA = Intrinsics(96, 72, 80.0, 80.0, 48.0, 36.0)
-
-
-@pytest.fixture(scope="module")
-def bank() -> TextureBank:
-    return texture_bank(size=128)
 
 
 def looking(at: Array, target: Array) -> Array:

@@ -18,12 +18,12 @@ from fieldfuse.capture import open_capture
 from fieldfuse.capture.checks import check_capture
 from fieldfuse.capture.ply_points import read_ply_points
 from fieldfuse.errors import InputError, Interrupted
-from fieldfuse.progress import Progress
 from fieldfuse.simulate import procedural
 from fieldfuse.simulate.materials import texture_bank
 from fieldfuse.simulate.mesh_scene import load_mesh_scene
 from fieldfuse.simulate.settings import read_scene_file, scene_file
 from fieldfuse.simulate.simulate import simulate
+from tests.stereo.made import Stopping
 
 SMALL = {"camera": {"width": 64, "height": 48}, "path": {"frames": 4, "fps": 4, "speed": 0.4}, "side": 1}
 
@@ -132,12 +132,8 @@ def test_compressed_pictures_are_jpeg_files(tmp_path: Path) -> None:
 
 
 def test_stopping_or_failing_leaves_nothing(tmp_path: Path) -> None:
-    class Stopped(Progress):
-        def stopping(self) -> bool:
-            return True
-
     with pytest.raises(Interrupted):
-        simulate(scene_file(SMALL, "test"), tmp_path / "out", progress=Stopped())
+        simulate(scene_file(SMALL, "test"), tmp_path / "out", progress=Stopping())
     assert list(tmp_path.iterdir()) == []
     (tmp_path / "full").mkdir()
     (tmp_path / "full" / "file").write_text("mine")

@@ -16,7 +16,7 @@ from fieldfuse.capture.checks import check_capture
 from fieldfuse.capture.prepare import prepare_views
 from fieldfuse.capture.types import Views
 from fieldfuse.config import CaptureSettings, load_settings
-from fieldfuse.evaluation.images import psnr
+from fieldfuse.evaluation.metrics import psnr
 from fieldfuse.poses.result import given_poses
 from fieldfuse.poses.scene import Scene, describe_scene
 from fieldfuse.render.image import make_renderer, render_view

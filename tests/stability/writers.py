@@ -191,7 +191,6 @@ ELSEWHERE = {
     "toolkit/poses/worker.py": "as above",
     "toolkit/evaluation/budget.py": "a cache: what cannot be written is not remembered",
     "toolkit/simulate/demo.py": "one video, for people, through `atomic_path`",
-    "toolkit/evaluation/tradeoff_plots.py": "draws into memory",
     "toolkit/evaluation/plots.py": "draws into memory",
     "pipelines/doctor.py": "a probe in a temporary folder",
 }

@@ -9,6 +9,7 @@ import numpy as np
 
 from fieldfuse.camera import Array, Intrinsics
 from fieldfuse.capture.types import Views
+from fieldfuse.progress import Progress
 from fieldfuse.stereo.match import StereoDepth
 from tests.poses.textured import PLANES, arc, render, texture
 
@@ -16,6 +17,13 @@ CAMERA = Intrinsics(160, 120, 150.0, 150.0, 80.0, 60.0)
 NEAR, FAR, MEDIAN = 1.0, 9.0, 3.4
 PASSED = {1: (20, 30), 4: (95, 50)}  # picture → left and top of somebody who stands before it
 WIDE, TALL = 38, 60
+
+
+class Stopping(Progress):
+    """The user asks to stop at once."""
+
+    def stopping(self) -> bool:
+        return True
 
 
 def views_of(poses: Array, pictures: list[Array], camera: Intrinsics = CAMERA) -> Views:

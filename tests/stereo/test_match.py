@@ -12,12 +12,11 @@ from fieldfuse.camera import Array, Intrinsics, pixel_grid
 from fieldfuse.capture.types import Views
 from fieldfuse.errors import InputError, Interrupted
 from fieldfuse.poses.overlap import parallax, spread_parallax
-from fieldfuse.progress import Progress
 from fieldfuse.stereo import match
 from fieldfuse.stereo.cost_volume import grey_view, plane_homography
 from fieldfuse.stereo.match import LENIENT, MANY, STRICT, StereoDepth, demands, inverse_depths, stereo_depths, usable_neighbours
 from tests.poses.textured import arc, look_at, render
-from tests.stereo.made import CAMERA, FAR, MEDIAN, NEAR, corner, relative_errors, views_of
+from tests.stereo.made import CAMERA, FAR, MEDIAN, NEAR, Stopping, corner, relative_errors, views_of
 
 
 @lru_cache(maxsize=1)
@@ -98,12 +97,8 @@ def test_what_cannot_be_matched_is_refused() -> None:
 
 
 def test_it_can_be_stopped() -> None:
-    class Stop(Progress):
-        def stopping(self) -> bool:
-            return True
-
     with pytest.raises(Interrupted):
-        stereo_depths(corner()[0], NEAR, FAR, MEDIAN, progress=Stop())
+        stereo_depths(corner()[0], NEAR, FAR, MEDIAN, progress=Stopping())
 
 
 def test_planes_lie_one_to_two_pixels_apart() -> None:

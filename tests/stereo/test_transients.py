@@ -15,11 +15,10 @@ from hypothesis import strategies as st
 from fieldfuse.camera import Array, Intrinsics, project, unproject
 from fieldfuse.capture.types import Views
 from fieldfuse.errors import InputError, Interrupted
-from fieldfuse.progress import Progress
 from fieldfuse.stereo import transients
 from fieldfuse.stereo.match import StereoDepth, stereo_depths
 from fieldfuse.stereo.transients import AGREED, SAME, LeftOut, consensus, load_left_out, save_left_out
-from tests.stereo.made import CAMERA, FAR, MEDIAN, NEAR, PASSED, TALL, WIDE, corner, with_passer
+from tests.stereo.made import CAMERA, FAR, MEDIAN, NEAR, PASSED, TALL, WIDE, Stopping, corner, with_passer
 
 
 @lru_cache(maxsize=2)
@@ -91,10 +90,6 @@ def test_masked_pixels_are_not_looked_at() -> None:
 
 
 def test_looking_can_be_stopped() -> None:
-    class Stopping(Progress):
-        def stopping(self) -> bool:
-            return True
-
     views, depths, _ = with_passer()
     with pytest.raises(Interrupted):
         transients.moving(views, depths, [CAMERA] * len(views), MEDIAN, True, Stopping())

@@ -9,14 +9,14 @@ import pytest
 import torch
 
 from fieldfuse.capture.types import Views
+from fieldfuse.render.color_backprojection import COLOURS, recoloured
 from fieldfuse.render.field import Field
 from fieldfuse.render.image import render_view
-from fieldfuse.render.recolour import COLOURS, recoloured
 from fieldfuse.training import finer_colours as module
 from fieldfuse.training.finer_colours import PIXELS, finer_colours
 from fieldfuse.training.levels import finer
 from fieldfuse.volume.host import TorchHost
-from tests.render.test_recolour import DEPTH, decibel, grey, painted, pictures_of, stripes
+from tests.render.test_color_backprojection import DEPTH, decibel, grey, painted, pictures_of, stripes
 
 
 @pytest.fixture(scope="module")

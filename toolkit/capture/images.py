@@ -14,8 +14,8 @@ import numpy as np
 from PIL import Image
 
 from fieldfuse.camera import Array
-from fieldfuse.capture import heif, lzfse
-from fieldfuse.capture.archive import read_bytes
+from fieldfuse.capture import heif
+from fieldfuse.capture.archive import MAPS, load_map, read_bytes
 from fieldfuse.capture.colours import to_srgb
 from fieldfuse.capture.headers import LYING, MAX_PIXELS, Header, image_header, orientation_of, read_header, unturned
 from fieldfuse.capture.sens import is_sens, sens_depth
@@ -93,7 +93,7 @@ def load_depth(frame: Frame, capture: Capture) -> Array:
 
     Stored values are divided by `capture.depth_scale`. 0, negative, NaN and infinite values are missing, so is 65535 in 16-bit images,
     and so is where the frame's confidence is 0. Where the depth camera stands beside the image's, the map is reprojected into that
-    (`depth_reprojection`). Read are 8/16-bit PNG, TIFF and PFM with whole or floating-point numbers, .npy arrays, LZFSE (`lzfse`), and
+    (`depth_reprojection`). Read are 8/16-bit PNG, TIFF and PFM with whole or floating-point numbers, .npy arrays, LZFSE (`archive`), and
     what `.sens` files hold.
 
     Raises:
@@ -222,8 +222,8 @@ def upright(image: Array, orientation: int) -> Array:
 def _values(path: Path, frame: Frame) -> Array:
     """What the file of a depth map, or of its confidence, holds."""
     camera = frame.depth_intrinsics
-    if path.suffix.lower() in lzfse.TYPES and camera is not None:
-        return lzfse.load_map(path, camera.width, camera.height)
+    if path.suffix.lower() in MAPS and camera is not None:
+        return load_map(path, camera.width, camera.height)
     return decode(path)[0]
 
 

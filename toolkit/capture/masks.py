@@ -328,7 +328,7 @@ def _shares(frames: Sequence[Frame], masked: Sequence[int]) -> tuple[dict[int, f
     unreadable: list[int] = []
     if not masked:
         return shares, unreadable
-    sizes = [image_header(mask).size for index in masked if (mask := frames[index].mask) is not None]
+    sizes = [image_header(path).size for index in masked if (path := frames[index].mask) is not None]
     most = max(8, int(PIXELS / max(1.0, float(np.mean([width * height for width, height in sizes])))))
     for index in spread(masked, min(most, len(masked))):
         try:

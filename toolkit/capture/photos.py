@@ -18,7 +18,7 @@ from typing import Any
 
 from PIL import Image
 
-from fieldfuse.capture.colmap_model import holds_model
+from fieldfuse.capture.colmap import holds_model
 from fieldfuse.capture.headers import image_header
 from fieldfuse.capture.heif import SUFFIXES as HEIF_SUFFIXES
 from fieldfuse.capture.listing import IMAGES, assemble, counted, images_in, natural_key, require_folder, some_of, words_of
@@ -142,7 +142,7 @@ def _of_one_capture(root: Path, folders: dict[Path, list[Path]]) -> tuple[list[P
         names = [f"{folder.relative_to(root).as_posix()}/ ({len(folders[folder])})" for folder in some]
         return some_of(names, 4).replace("./ ", "the folder itself ")
 
-    sizes, used, others = _sizes(folders[main]), [main], []
+    sizes, used, others = _sizes(folders[main]), [main], list[Path]()
     for folder, images in folders.items():
         if folder != main:
             alike = len(images) > 1 and (bool(sizes & _sizes(images)) or stem(folder.name) == stem(main.name) != "")

@@ -63,7 +63,8 @@ def _frame(image: Path, camera: Path, name: str) -> Frame:
     if len(values) < len(KEYS):
         absent = next(key for key in KEYS if key not in values)
         raise InputError(f"{where} has no {absent!r}; export the raw data again, or remove this key frame")
-    lens = Intrinsics(*usable_size(values["width"], values["height"], where), *(values[key] for key in ("fx", "fy", "cx", "cy")))
+    fx, fy, cx, cy = (values[key] for key in ("fx", "fy", "cx", "cy"))
+    lens = Intrinsics(*usable_size(values["width"], values["height"], where), fx, fy, cx, cy)
     pose: Array = np.eye(4)
     pose[:3] = np.reshape([values[key] for key in POSE], (3, 4))
     depth, confidence = (image.parent.parent / kind / f"{image.stem}.png" for kind in ("depth", "confidence"))

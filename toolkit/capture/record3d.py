@@ -26,8 +26,7 @@ from typing import Any
 import numpy as np
 
 from fieldfuse.camera import Array, Intrinsics, world_from_opengl
-from fieldfuse.capture import lzfse
-from fieldfuse.capture.archive import members, read_bytes, read_member
+from fieldfuse.capture.archive import MAP_PIXELS, count_pixels, members, read_bytes, read_member, require_lzfse
 from fieldfuse.capture.calibration import MAX_SIDE, fitted, from_matrix
 from fieldfuse.capture.headers import read_header
 from fieldfuse.capture.listing import assemble, counted, files_in, images_in, is_file, number, numbers, read_object
@@ -219,15 +218,15 @@ def _depth_size(data: dict[str, Any], maps: list[Path], size: tuple[int, int], w
     """
     if not maps:
         return None
-    lzfse.require(maps[0])
+    require_lzfse(maps[0])
     width, height = _side(data, "dw", where), _side(data, "dh", where)
     if width is None or height is None:
-        pixels = lzfse.count_pixels(maps[0])
+        pixels = count_pixels(maps[0])
         height = round(math.sqrt(pixels * size[1] / size[0]))
         width = pixels // max(height, 1)
         if not pixels or width * height != pixels:
             raise InputError(f"{where} does not have the size of the depth ('dw', 'dh'), and it is no smaller image; export it again")
-    if width * height > lzfse.MOST_PIXELS:
+    if width * height > MAP_PIXELS:
         raise InputError(f"{where}: depth of {width}×{height} cannot be; {AGAIN}")
     for across, down in ((width, height), (height, width)):
         if abs(across * size[1] / (down * size[0]) - 1) < SAME_SHAPE:

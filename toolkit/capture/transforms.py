@@ -69,7 +69,7 @@ def read_transforms(path: Path | str, within: Path | None = None) -> Capture:
     applied_scale = _positive(data, "applied_scale", json_path)
     if applied_scale is not None:
         extra["applied_scale"] = applied_scale
-    points, point_remarks = None, []
+    points, point_remarks = None, list[str]()
     if (listed_points := nerf_json.listed_names([data], ("ply_file_path",), json_path)) != [None]:
         (ply,), point_remarks = folder.find_beside(listed_points, POINTS, (), json_path.name, base)
         if ply is None:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
 
@@ -60,7 +61,7 @@ def with_usable_depth(capture: Capture) -> Capture:
     first = next(iter(bad.values()))
     if len(bad) > MOST_BAD * total:
         raise InputError(f"{first} ({len(bad)} of {total} depth maps are like this)" if len(bad) > 1 else first)
-    none = {"depth": None, "depth_intrinsics": None, "confidence": None, "depth_pose": None}
+    none: dict[str, Any] = {"depth": None, "depth_intrinsics": None, "confidence": None, "depth_pose": None}
     frames = [replace(frame, **none) if frame.name in bad else frame for frame in capture.frames]
     return capture.with_frames(frames, f"{counted(len(bad), 'frame is', 'frames are')} used without depth ({some_of(list(bad))}): {first}")
 

@@ -16,36 +16,36 @@ from fieldfuse.errors import FieldfuseError
 from fieldfuse.files import fingerprint, read_json, write_json
 from fieldfuse.poses.job import MAX_EXHAUSTIVE
 
-SIZES = (160, 240, 320, 400, 480, 640, 800, 960)  # long sides that pictures are brought to
-RAYS_A_PIXEL = 0.6  # rays that a fit should have for each training pixel: with fewer, smaller pictures end better in the same time
+SIZES = (160, 240, 320, 400, 480, 640, 800, 960)  # long sides that images are brought to
+RAYS_A_PIXEL = 0.6  # rays that a fit should have for each training pixel: with fewer, smaller images end better in the same time
 VOXELS_A_RAY = 2.0  # as the schedule: a finer level is worth its voxels only when so few rays are left for each
 SURFACE = 3.0  # occupied voxels of a lattice of n a side, in n²
-FIT_SHARE = 0.35  # of the seconds, at least, that the fit should have when pictures are chosen …
+FIT_SHARE = 0.35  # of the seconds, at least, that the fit should have when images are chosen …
 FRAMES_SHARE = 0.25  # … and when a video's frames are: more of them are worth more than larger ones, or than more seconds of fitting
 ENOUGH = 30.0  # seconds of fitting that textures and a page need not give way to, whatever share they are
-NEARLY = 0.8  # of the seconds that the smallest pictures would leave, where they do not leave that share
+NEARLY = 0.8  # of the seconds that the smallest images would leave, where they do not leave that share
 LEAST_FIT = 2.0  # seconds
-STEADY = 5.0  # seconds of stages that count as predicted well when it is told how busy the machine is: first imports are no sign of it
+STEADY = 5.0  # seconds of stages that count as predicted well when the machine's load is judged: first imports are no sign of it
 EXPORT_SHARE = 0.25  # of the seconds, at most, that are planned for exports
-# Pictures' worth of features that a mesh takes: whatever it is of; of a megapixel of one view, for its triangles, and of all views, to make
+# Images' worth of features that a mesh takes: whatever it is of; of a megapixel of one view, for its triangles, and of all views, to make
 # their depth agree, to polish, fuse and carve; each by the pixels that are rendered, and by those of the depth that is made of them.
 MESH_FIXED, MESH_TRIANGLES, MESH_DEPTH = 2.3, (145.0, 48.0), (23.0, 6.0)
-# For a texture besides: a coarser mesh, and of each training picture what it sees and its texels; for a page: what training rays see.
+# For a texture besides: a coarser mesh, and of each training image what it sees and its texels; for a page: what training rays see.
 TEXTURE_FIXED, TEXTURE_PICTURE, PAGE = 18.0, 0.2, 14.0
-OBJECT = 0.5  # of that where pictures have alpha: the object fills a part of them
+OBJECT = 0.5  # of that where images have alpha: the object fills a part of them
 MESH_SIDE, VIDEO_SIDE = 400, 640  # long sides that are rendered at most
 EXPORT_RAY = 1.2  # of the time of a test view's ray: writing video frames comes on top
 MESH_SHARE = 0.6  # of the exports' seconds, the rest is the video's
 FRAME_COUNTS = (100, 75, 50, 36, 24)  # of a video
 MESH_VIEWS, VIDEO_FRAMES = (12, 60), (24, 90)  # fewest and most
 SIFT_FRAMES = 100
-# Pictures' worth of features that poses take: a picture, a megapixel of one and of each pair that is matched, and for each other
-# picture that is adjusted with it. Of two videos with 24 to 100 frames (0.3 and 0.9 megapixels) it tells the seconds within 60%.
+# Images' worth of features that poses take: an image, a megapixel of one and of each pair that is matched, and for each other
+# image that is adjusted with it. Of two videos with 24 to 100 frames (0.3 and 0.9 megapixels) the seconds are right within 60%.
 SFM_PICTURE, SFM_FEATURES, SFM_PAIR, SFM_MAPPING = 0.5, 1.6, 0.7, 0.018
-HEIF = 4.0  # times as long as choosing a frame of a video takes: decoding a picture and writing it as JPEG, two threads
+HEIF = 4.0  # times as long as choosing a frame of a video takes: decoding an image and writing it as JPEG, two threads
 NEIGHBOURS, ALIKE = 5, 12  # pairs for each frame of a video; for each of more photos than are matched with all others
-EFFECTS_LOOKED_AT = 40  # training pictures at most that are looked at for effects; all, when one is corrected picture by picture …
-CORRECTED = 0.4  # … which this share of captures asks for
+EFFECTS_LOOKED_AT = 40  # training images at most that are looked at for effects; all, when one is corrected image by image …
+CORRECTED = 0.4  # … which this share of captures needs
 EFFECTS_SHARE = 0.5  # of the seconds, at most, that looking for effects may take
 AGREES = 0.15  # relative error of a prediction that is still good
 LEARNING = 0.7  # of what a run shows about a factor, the part that is believed
@@ -68,15 +68,15 @@ COST = {
     "report": ("decode", 75.0),
 }
 KINDS = ("decode", "features", "ray", "fit", "score")
-COUNTED = 4  # raised when a stage's work is counted in another way: what was learnt before says nothing then
+COUNTED = 4  # raised when a stage's work is counted in another way: what was learnt before is of no use then
 
 
 @dataclass(frozen=True)
 class Work:
-    """What a capture asks for.
+    """How much work a capture is.
 
     Attributes:
-        frames, width, height: pictures that are used, and their size as they lie on disk. total: of a video's frames, else `frames`.
+        frames, width, height: images that are used, and their size as they lie on disk. total: of a video's frames, else `frames`.
     """
 
     frames: int
@@ -85,21 +85,21 @@ class Work:
     test: int
     posed: bool
     depth: bool
-    outlined: bool  # depth, alpha or points tell where the scene is; nothing has to be triangulated
+    outlined: bool  # depth, alpha or points show where the scene is; nothing has to be triangulated
     video: bool = False
     total: int = 0
     effects: bool = False  # they are looked for
-    alpha: bool = False  # pictures of an object alone
+    alpha: bool = False  # images of an object alone
     texture: bool = False  # meshes are to have one
     page: bool = False  # the field is to be walked through in a browser
-    converted: int = 0  # pictures that are HEIF, and are written as JPEG first
+    converted: int = 0  # images that are HEIF, and are written as JPEG first
 
     @property
     def megapixels(self) -> float:
         return self.width * self.height / 1e6
 
     def pixels(self, long_side: int) -> float:
-        """Of one picture brought to `long_side`."""
+        """Of one image brought to `long_side`."""
         factor = min(1.0, long_side / max(self.width, self.height))
         return self.width * self.height * factor * factor
 
@@ -161,7 +161,7 @@ class Speed:
 
 
 def amounts(work: Work, choice: Choice) -> dict[str, float]:
-    """Stage → amount of work: megapixels decoded, pictures looked at for features, rays, megapixels scored."""
+    """Stage → amount of work: megapixels decoded, images looked at for features, rays, megapixels scored."""
     frames = min(work.frames, choice.max_frames or work.frames)
     test = work.test * frames / max(work.frames, 1)
     pixels = work.pixels(choice.image_size)
@@ -183,7 +183,7 @@ def amounts(work: Work, choice: Choice) -> dict[str, float]:
 
 
 def effects_work(work: Work, choice: Choice | None = None, every: float = 1.0) -> float:
-    """Pictures whose features are found and matched; `every`: how likely all of them are looked at once more, since one is corrected. Half
+    """Images whose features are found and matched; `every`: how likely all of them are looked at once more, since one is corrected. Half
     where structure from motion leaves points."""
     frames = min(work.frames, (choice.max_frames if choice is not None else None) or work.frames)
     test = work.test * frames / max(work.frames, 1)
@@ -191,8 +191,8 @@ def effects_work(work: Work, choice: Choice | None = None, every: float = 1.0) -
 
 
 def sfm_work(work: Work, frames: int) -> float:
-    """Pictures' worth of features that structure from motion takes. It matches neighbours of a video and all pairs of few photos; adjusting
-    a model takes the longer the more pictures it has."""
+    """Images' worth of features that structure from motion takes. It matches neighbours of a video and all pairs of few photos; adjusting
+    a model takes the longer the more images it has."""
     pairs = NEIGHBOURS if work.video else frames / 2 if frames <= MAX_EXHAUSTIVE else ALIKE
     each = (SFM_FEATURES + SFM_PAIR * pairs) * work.pixels(PosesSettings.image_size) / 1e6
     return frames * (SFM_PICTURE + each + SFM_MAPPING * frames)
@@ -203,13 +203,13 @@ def video_rays(work: Work, choice: Choice) -> float:
     return (choice.video_frames or 0) * work.pixels(min(VIDEO_SIDE, choice.image_size))
 
 
-def texture_work(pictures: float) -> float:
-    """Pictures' worth of features that a texture of so many training pictures takes."""
-    return TEXTURE_FIXED + TEXTURE_PICTURE * pictures
+def texture_work(images: float) -> float:
+    """Images' worth of features that a texture of so many training images takes."""
+    return TEXTURE_FIXED + TEXTURE_PICTURE * images
 
 
 def mesh_work(work: Work, choice: Choice) -> tuple[float, float]:
-    """Pictures' worth of features that a mesh takes beside its views, its texture and the page among them, and for each view."""
+    """Images' worth of features that a mesh takes beside its views, its texture and the page among them, and for each view."""
     rendered = min(MESH_SIDE, choice.image_size)
     sizes = [work.pixels(side) / 1e6 * (OBJECT if work.alpha else 1.0) for side in (rendered, choice.mesh_size or rendered)]
     frames = min(work.frames, choice.max_frames or work.frames)
@@ -219,7 +219,7 @@ def mesh_work(work: Work, choice: Choice) -> tuple[float, float]:
 
 
 def most_export_seconds(speed: Speed, work: Work, choice: Choice, mesh_views: int, video_frames: int) -> float:
-    """What exports take when nothing of them is left out: more than that they cannot use."""
+    """What exports take when all of them are made: more than that they cannot use."""
     once, each = mesh_work(work, choice)
     video = video_rays(work, replace(choice, video_frames=video_frames)) * EXPORT_RAY * speed.seconds("render", 1.0)
     return speed.factors.get("export", 1.0) * ((once + mesh_views * each) * speed.units["features"] + video)
@@ -231,14 +231,14 @@ def least_export_seconds(speed: Speed, work: Work, choice: Choice) -> float:
 
 
 def predict(speed: Speed, work: Work, choice: Choice) -> dict[str, float]:
-    """Stage → seconds, the fit left out."""
+    """Stage → seconds, without the fit."""
     return {stage: speed.seconds(stage, amount) for stage, amount in amounts(work, choice).items() if amount > 0}
 
 
 def choose(speed: Speed, work: Work, total: float, most_frames: int = 150) -> Choice:
-    """Picture size and, for a video, how many frames, for a run of `total` seconds.
+    """Image size and, for a video, how many frames, for a run of `total` seconds.
 
-    The largest pictures whose fit still gets `FIT_SHARE` of the seconds and enough rays for its training pixels; of a video the most
+    The largest images whose fit still gets `FIT_SHARE` of the seconds and enough rays for its training pixels; of a video the most
     frames that leave it `FRAMES_SHARE`. Where other things take so much that no size leaves that share, size has little to do with it:
     then the largest that leaves nearly as much as any. The smallest of everything when there are never rays enough.
     """
@@ -253,27 +253,18 @@ def choose(speed: Speed, work: Work, total: float, most_frames: int = 150) -> Ch
         left = {size: total * (1 - EXPORT_SHARE) - taken[size] for size in sizes}
         most = max(left.values())
         least = min(FIT_SHARE * total, NEARLY * most)
-        fitting = [size for size in sizes if left[size] >= least and _rays(speed, left[size]) >= _wanted_rays(work, Choice(size, count))]
+        training = (1 - work.test / max(work.frames, 1)) * min(work.frames, count or work.frames)
+        rays = {size: RAYS_A_PIXEL * training * work.pixels(size) for size in sizes}
+        fitting = [size for size in sizes if left[size] >= least and left[size] / speed.units["fit"] >= rays[size]]
         if fitting:
             return Choice(max(fitting), count)
     return Choice(SIZES[0], counts[-1])
 
 
 def left_for_fit(speed: Speed, work: Work, seconds: float) -> float:
-    """What pictures as `choose` takes them and the least that is exported leave of `seconds`."""
+    """What images as `choose` takes them and the least that is exported leave of `seconds`."""
     choice = choose(speed, work, seconds)
     return seconds - sum(predict(speed, work, choice).values()) - least_export_seconds(speed, work, choice)
-
-
-def _rays(speed: Speed, seconds: float) -> float:
-    """That a fit has in so many seconds."""
-    return seconds / speed.units["fit"]
-
-
-def _wanted_rays(work: Work, choice: Choice) -> float:
-    """That a fit should have."""
-    training = (1 - work.test / max(work.frames, 1)) * min(work.frames, choice.max_frames or work.frames)
-    return RAYS_A_PIXEL * training * work.pixels(choice.image_size)
 
 
 def fit_seconds(total: float, spent: float, rest: float) -> float:

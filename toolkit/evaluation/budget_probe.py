@@ -1,4 +1,4 @@
-"""The quick self-test behind `fieldfuse.evaluation.budget`: a few seconds that tell what a unit of each kind of work takes here."""
+"""The quick self-test behind `fieldfuse.evaluation.budget`: a few seconds that measure a unit of each kind of work."""
 
 from __future__ import annotations
 
@@ -7,7 +7,6 @@ from collections.abc import Callable
 
 import cv2
 import numpy as np
-import torch
 
 from fieldfuse.config import Settings
 from fieldfuse.evaluation.budget import KINDS, Speed
@@ -17,10 +16,12 @@ SECONDS = 0.4  # for each kind, after a first call that does not count
 SIDE = 128  # voxels and pixels a side of what is rendered and fitted
 RAYS = 1024
 
+Piece = tuple[Callable[[], object], float]  # work, and how many units it is
+
 
 def self_test(settings: Settings) -> Speed:
-    """Units of every kind in seconds: a megapixel decoded, a picture's features found and matched, a ray rendered, a ray fitted, a
-    megapixel scored."""
+    """Units of every kind in seconds: a megapixel decoded, an image's features found and matched, a ray rendered, a ray fitted, a megapixel
+    scored."""
     from fieldfuse.progress import SILENT
     from fieldfuse.stereo import fast_mvs
     from fieldfuse.training import depth_start
@@ -29,28 +30,17 @@ def self_test(settings: Settings) -> Speed:
     warm_up(settings, SILENT)
     fast_mvs.warm_up()
     depth_start.warm_up()
-    makers: dict[str, Callable[[], tuple[Callable[[], object], float]]] = {
-        "decode": _decode,
-        "features": _features,
-        "ray": _ray,
-        "fit": _fit,
-        "score": _score,
-    }
+    makers = {"decode": _decode, "features": _features, "ray": _ray, "fit": _fit, "score": _score}
     units = {}
     for kind in KINDS:
         work, amount = makers[kind]()
-        units[kind] = _each(work) / amount
-    return Speed(units)
-
-
-def _each(work: Callable[[], object]) -> float:
-    """Seconds of one call, the mean over `SECONDS`: other load on the machine counts as it comes."""
-    work()
-    start, count = time.perf_counter(), 0
-    while count == 0 or time.perf_counter() - start < SECONDS:
         work()
-        count += 1
-    return (time.perf_counter() - start) / count
+        start, count = time.perf_counter(), 0
+        while count == 0 or time.perf_counter() - start < SECONDS:  # the mean: other load on the machine counts as it comes
+            work()
+            count += 1
+        units[kind] = (time.perf_counter() - start) / count / amount
+    return Speed(units)
 
 
 def texture(height: int, width: int) -> np.ndarray:
@@ -63,18 +53,18 @@ def texture(height: int, width: int) -> np.ndarray:
     return np.clip(out * 255, 0, 255).astype(np.uint8)
 
 
-def _decode() -> tuple[Callable[[], object], float]:
+def _decode() -> Piece:
     _, data = cv2.imencode(".jpg", texture(480, 640))
 
     def work() -> None:
-        picture = cv2.imdecode(data, cv2.IMREAD_COLOR)
-        assert picture is not None
-        cv2.resize(picture, (320, 240), interpolation=cv2.INTER_AREA)
+        image = cv2.imdecode(data, cv2.IMREAD_COLOR)
+        assert image is not None
+        cv2.resize(image, (320, 240), interpolation=cv2.INTER_AREA)
 
     return work, 640 * 480 / 1e6
 
 
-def _features() -> tuple[Callable[[], object], float]:
+def _features() -> Piece:
     from fieldfuse.poses.points import FEATURES, mutual_matches
 
     grey = cv2.cvtColor(texture(480, 640), cv2.COLOR_RGB2GRAY)
@@ -83,13 +73,13 @@ def _features() -> tuple[Callable[[], object], float]:
     def work() -> None:
         _, found = finder.detectAndCompute(grey, None)
         unit = found / np.maximum(np.linalg.norm(found, axis=1, keepdims=True), 1e-9)
-        for _ in range(3):  # as many pairs as there are for each picture
+        for _ in range(3):  # as many pairs as there are for each image
             mutual_matches(unit, unit)
 
     return work, 1.0
 
 
-def _ray() -> tuple[Callable[[], object], float]:
+def _ray() -> Piece:
     from fieldfuse.render.image import make_renderer, render_view
 
     field = sphere_field(SIDE)
@@ -97,7 +87,7 @@ def _ray() -> tuple[Callable[[], object], float]:
     return lambda: render_view(field, camera, pose, view), float(SIDE * SIDE)
 
 
-def _fit() -> tuple[Callable[[], object], float]:
+def _fit() -> Piece:
     from fieldfuse.training.losses import Rates
     from fieldfuse.training.numba_engine import NumbaEngine
 
@@ -105,15 +95,14 @@ def _fit() -> tuple[Callable[[], object], float]:
     return lambda: engine.step(RAYS, rates), float(RAYS)
 
 
-def _score() -> tuple[Callable[[], object], float]:
-    from fieldfuse.evaluation.images import lpips, psnr, ssim
+def _score() -> Piece:
+    from fieldfuse.evaluation.score import MEASURES
 
     generator = np.random.default_rng(0)
     first, second = (generator.integers(0, 256, (120, 160, 3), dtype=np.uint8) for _ in range(2))
 
     def work() -> None:
-        for measure in (psnr, ssim, lpips):
+        for measure in MEASURES.values():
             measure(first, second, None)
 
-    with torch.no_grad():
-        return work, 120 * 160 / 1e6
+    return work, 120 * 160 / 1e6

@@ -3,14 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
-from fieldfuse import __version__
 from fieldfuse.errors import InputError
 from fieldfuse.evaluation import words
 from fieldfuse.evaluation.geometry import VOXELS
-from fieldfuse.evaluation.report import CAPTURE, POSES, STAGE, plain
+from fieldfuse.evaluation.report import STAGE, part, parts, plain, whole
 
 # Always there in a method, null when not known.
 METHOD = ("key", "title", "note", "reference", "stages", "seconds", "mesh_seconds", "peak_memory_mb", "disk_bytes", "memory_bytes")
@@ -35,9 +34,6 @@ class Row:
     cells: list[Cell]
 
 
-Format = Callable[[Any], str]
-
-
 def compare_data(data: dict[str, Any]) -> dict[str, Any]:
     """`data` in the fixed form of `compare.json`, plain JSON: `methods` (a list, each with all of `METHOD` and `RESULTS`), `truth`, and the
     facts of the run that `report.json` has, too. Applying it twice changes nothing.
@@ -54,60 +50,84 @@ def compare_data(data: dict[str, Any]) -> dict[str, Any]:
         raise InputError("a comparison is made of `methods`, a list of tables, and there is none; run the methods first")
     out = []
     for method in methods:
-        stages = [{**dict.fromkeys(STAGE), **stage} for stage in method.get("stages") or []]
+        stages = parts(method.get("stages"), STAGE, "stages")
         seconds = [stage["seconds"] for stage in stages if stage["seconds"] is not None]
         memory = [stage["peak_memory_mb"] for stage in stages if stage["peak_memory_mb"] is not None]
         known = {"seconds": round(sum(seconds), 3) if seconds else None, "peak_memory_mb": max(memory) if memory else None}
         out.append({**dict.fromkeys(METHOD + RESULTS), **method, "stages": stages, **known})
-    known = {
-        "version": data.get("version") or __version__,
-        "command": data.get("command"),
-        "created": data.get("created"),
-        "source": data.get("source"),
-        "warnings": [str(warning) for warning in data.get("warnings") or []],
-        "capture": {**dict.fromkeys(CAPTURE), **(data.get("capture") or {})},
-        "poses": {**dict.fromkeys(POSES), **(data.get("poses") or {})},
-        "scene": data.get("scene"),
-        "truth": {**dict.fromkeys(TRUTH), **(data.get("truth") or {})},
-        "methods": out,
-        "stages": [{**dict.fromkeys(STAGE), **stage} for stage in data.get("stages") or []],
-        "matching": data.get("matching"),
-        "settings": data.get("settings") or {},
-        "machine": data.get("machine") or {},
-    }
-    return {**known, **{key: value for key, value in data.items() if key not in known}}
+    truth = part(data.get("truth"), TRUTH, "truth")
+    return whole(data, truth=truth, methods=out, matching=data.get("matching"), machine=data.get("machine") or {})
 
 
 def table(data: dict[str, Any]) -> list[tuple[str, list[Row]]]:
     """Groups of rows; rows that no method has a number for are left out. `data` as `compare_data` answers it."""
     methods = data["methods"]
+    unit = data["truth"]["unit"] or "units"
+
+    def row(label: str, path: str, show: Callable[[Any], str], better: Any = None, note: str = "") -> list[Row]:
+        return _row(methods, label, path, show, better, note)
+
+    def images(within: str, note: str = "") -> list[Row]:
+        out = [
+            *row("PSNR (dB) ↑", f"score {within} psnr", words.decimal, max),
+            *row("SSIM ↑", f"score {within} ssim", lambda value: words.decimal(value, 3), max),
+            *row("LPIPS ↓", f"score {within} lpips", lambda value: words.decimal(value, 3), min),
+        ]
+        return [replace(one, note=note if place == 0 else "") for place, one in enumerate(out)]
+
+    by_stage = [{stage["name"]: stage["seconds"] for stage in method["stages"]} for method in methods]
+    cost = [
+        *row("Time to make it", "seconds", words.duration, min, "with its test views, after the shared stages"),
+        *(
+            Row(f"· stage {name}", "", [Cell(words.duration(known.get(name))) for known in by_stage])
+            for name in dict.fromkeys(name for known in by_stage for name in known)
+        ),
+        *row("Time for its mesh besides", "mesh_seconds", words.duration),
+        *row("Time to render a test view", "score seconds_per_view", words.duration, min),
+        *row("Peak memory", "peak_memory_mb", words.memory, min, "of the whole process during its stages"),
+        *row("Size on disk", "disk_bytes", words.size, min, "what rendering needs"),
+        *row("Size in memory", "memory_bytes", words.size, min),
+    ]
+    paths = ("score depth_scale", "geometry voxel_size")
+    scale, voxel = (next((value for m in methods if (value := _at(m, path)) is not None), None) for path in paths)
+    against = {"exact": "the exact depth", "sensor": "the depth sensor"}.get(str(data["truth"]["depth"]), "the true depth")
+    depth = [
+        *row("Mean error ↓", "score abs_err", _percent, min, "" if scale is None else f"of the median depth, {words.significant(scale)}"),
+        *row("Within 1% ↑", "score acc_1", words.share, max, "what is missing counts as wrong"),
+        *row("Within 5% ↑", "score acc_5", words.share, max),
+        *row("Median relative error ↓", "score depth median_rel", _percent, min, "where there is depth"),
+        *row("Pixels with depth ↑", "score depth coverage", words.share, max),
+    ]
+    geometry = [
+        *row(f"Accuracy ({unit}) ↓", "geometry accuracy", words.significant, min, "mean distance from mesh to truth"),
+        *row(f"Completeness ({unit}) ↓", "geometry completeness", words.significant, min, "mean distance from truth to mesh"),
+    ]
+    for n in VOXELS:
+        note = f"{words.significant(n * voxel)} {unit}" if voxel is not None else ""
+        geometry += row(f"F-score at {n} voxel{'' if n == 1 else 's'} ↑", f"geometry f_score_{n}", words.share, max, note)
+    geometry += row("Normals off by ↓", "geometry normals", _degrees, min, "in the mean, within 4 voxels of the truth")
+    surfaces = [m for m in methods if not m["reference"] and m["key"] in (_at(m, "score on") or {})]  # those that leave pixels empty
     groups = [
-        ("Cost", _cost(methods)),
-        ("Pictures of test views, whole", _pictures(methods, ())),
-        *((f"The same where {title} shows surface", _pictures(methods, ("on", key), share=key)) for key, title in _surfaces(methods)),
-        (_depth_title(data), _depth(methods)),
-        ("Mesh against the true surface that the cameras saw", _geometry(methods, data["truth"]["unit"] or "units")),
-        ("Mesh", _mesh(methods)),
+        ("Cost", cost),
+        ("Pictures of test views, whole", images("")),
+        *((f"The same where {m['title']} shows surface", images(f"on {m['key']}", _of_pixels(m))) for m in surfaces),
+        (f"Depth of test views against {against}", depth),
+        ("Mesh against the true surface that the cameras saw", geometry),
+        ("Mesh", [*row("Triangles", "mesh triangles", words.whole), *row("Separate parts", "mesh components", words.whole)]),
     ]
     return [(title, rows) for title, rows in groups if rows]
 
 
-def _surfaces(methods: Sequence[dict[str, Any]]) -> list[tuple[str, str]]:
-    """Key and title of the methods that leave pixels empty."""
-    own = [method for method in methods if not method["reference"]]
-    return [(method["key"], method["title"]) for method in own if method["key"] in ((method["score"] or {}).get("on") or {})]
-
-
-def _at(method: dict[str, Any], *path: str) -> Any:
+def _at(method: dict[str, Any], path: str) -> Any:
     value: Any = method
-    for key in path:
+    for key in path.split():
         value = value.get(key) if isinstance(value, dict) else None
     return value
 
 
-def _row(label: str, methods: Sequence[dict[str, Any]], path: Sequence[str], show: Format, better: Any = None, note: str = "") -> list[Row]:
+def _row(methods: Sequence[dict[str, Any]], label: str, path: str, show: Callable[[Any], str], better: Any, note: str) -> list[Row]:
     """One row, or none when no method has the number; the best is marked when at least two have it and they differ."""
-    values = [_at(method, *path) for method in methods]
+    values = [_at(method, path) for method in methods]
     if all(value is None for value in values):
         return []
     rivals = [value for value, method in zip(values, methods, strict=True) if value is not None and not method["reference"]]
@@ -117,78 +137,16 @@ def _row(label: str, methods: Sequence[dict[str, Any]], path: Sequence[str], sho
     return [Row(label, note, [Cell(show(value), mark) for value, mark in zip(values, marks, strict=True)])]
 
 
+def _of_pixels(method: dict[str, Any]) -> str:
+    return f"{words.share(_at(method, 'score coverage'))} of the pixels"
+
+
 def _percent(value: float | None) -> str:
     return words.NONE if value is None else f"{100 * value:.2f}%"
 
 
 def _degrees(value: float | None) -> str:
     return words.NONE if value is None else f"{value:.1f}°"
-
-
-def _cost(methods: Sequence[dict[str, Any]]) -> list[Row]:
-    return [
-        *_row("Time to make it", methods, ("seconds",), words.duration, min, "with its test views, after the shared stages"),
-        *_stage_rows(methods),
-        *_row("Time for its mesh besides", methods, ("mesh_seconds",), words.duration),
-        *_row("Time to render a test view", methods, ("score", "seconds_per_view"), words.duration, min),
-        *_row("Peak memory", methods, ("peak_memory_mb",), words.memory, min, "of the whole process during its stages"),
-        *_row("Size on disk", methods, ("disk_bytes",), words.size, min, "what rendering needs"),
-        *_row("Size in memory", methods, ("memory_bytes",), words.size, min),
-    ]
-
-
-def _stage_rows(methods: Sequence[dict[str, Any]]) -> list[Row]:
-    """The seconds of each method's own stages."""
-    by_name = [{stage["name"]: stage["seconds"] for stage in method["stages"]} for method in methods]
-    names = dict.fromkeys(name for known in by_name for name in known)
-    return [Row(f"· stage {name}", "", [Cell(words.duration(known.get(name))) for known in by_name]) for name in names]
-
-
-def _pictures(methods: Sequence[dict[str, Any]], within: tuple[str, ...], share: str | None = None) -> list[Row]:
-    path = ("score", *within)
-    rows = [
-        *_row("PSNR (dB) ↑", methods, (*path, "psnr"), words.decimal, max),
-        *_row("SSIM ↑", methods, (*path, "ssim"), lambda value: words.decimal(value, 3), max),
-        *_row("LPIPS ↓", methods, (*path, "lpips"), lambda value: words.decimal(value, 3), min),
-    ]
-    if share is not None:
-        surface = next(method for method in methods if method["key"] == share)
-        note = f"{words.share(_at(surface, 'score', 'coverage'))} of the pixels"
-        rows = [Row(row.label, note if place == 0 else "", row.cells) for place, row in enumerate(rows)]
-    return rows
-
-
-def _depth_title(data: dict[str, Any]) -> str:
-    against = {"exact": "the exact depth", "sensor": "the depth sensor"}.get(str(data["truth"]["depth"]), "the true depth")
-    return f"Depth of test views against {against}"
-
-
-def _depth(methods: Sequence[dict[str, Any]]) -> list[Row]:
-    scale = next((value for method in methods if (value := _at(method, "score", "depth_scale")) is not None), None)
-    of_scale = "" if scale is None else f"of the median depth, {words.significant(scale)}"
-    return [
-        *_row("Mean error ↓", methods, ("score", "abs_err"), _percent, min, of_scale),
-        *_row("Within 1% ↑", methods, ("score", "acc_1"), words.share, max, "what is missing counts as wrong"),
-        *_row("Within 5% ↑", methods, ("score", "acc_5"), words.share, max),
-        *_row("Median relative error ↓", methods, ("score", "depth", "median_rel"), _percent, min, "where there is depth"),
-        *_row("Pixels with depth ↑", methods, ("score", "depth", "coverage"), words.share, max),
-    ]
-
-
-def _geometry(methods: Sequence[dict[str, Any]], unit: str) -> list[Row]:
-    voxel = next((value for method in methods if (value := _at(method, "geometry", "voxel_size")) is not None), None)
-    scores = []
-    for n in VOXELS:
-        note = f"{words.significant(n * voxel)} {unit}" if voxel is not None else ""
-        scores += _row(f"F-score at {n} voxel{'' if n == 1 else 's'} ↑", methods, ("geometry", f"f_score_{n}"), words.share, max, note)
-    return [
-        *_row(f"Accuracy ({unit}) ↓", methods, ("geometry", "accuracy"), words.significant, min, "mean distance from mesh to truth"),
-        *_row(
-            f"Completeness ({unit}) ↓", methods, ("geometry", "completeness"), words.significant, min, "mean distance from truth to mesh"
-        ),
-        *scores,
-        *_row("Normals off by ↓", methods, ("geometry", "normals"), _degrees, min, "in the mean, within 4 voxels of the truth"),
-    ]
 
 
 def matching_line(data: dict[str, Any]) -> str | None:
@@ -203,10 +161,3 @@ def matching_line(data: dict[str, Any]) -> str | None:
     if found.get("median_rel_textured") is not None:
         text += f"; where there is texture {_percent(found['median_rel_textured'])} on {words.share(found['coverage_textured'])}"
     return text + "."
-
-
-def _mesh(methods: Sequence[dict[str, Any]]) -> list[Row]:
-    return [
-        *_row("Triangles", methods, ("mesh", "triangles"), words.whole),
-        *_row("Separate parts", methods, ("mesh", "components"), words.whole),
-    ]

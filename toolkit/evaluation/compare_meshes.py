@@ -19,7 +19,6 @@ ELEVATION = np.deg2rad(40)
 FIELD_OF_VIEW = np.deg2rad(42)
 CLOSE = 0.8  # distance of the eye in the view from outside; at 1 the region's bounding sphere fits in, corners and all
 BEYOND = 1.15  # what lies farther out than this times the region is cut off in the view from outside
-KINDS = ("coloured", "shape", "distance")
 
 
 @dataclass(frozen=True)
@@ -44,21 +43,30 @@ def mesh_pictures(
         cut: box (lowest and highest corner); when given, triangles outside it and those that face away are left out, so that one looks
             into a room from outside as into a doll's house.
     """
-    shown = {name: mesh for name, mesh in [("truth", truth), *meshes.items()] if mesh is not None and len(mesh.triangles)}
-    gaps = {name: _gap_colours(mesh, truth, voxel_size) for name, mesh in shown.items() if name != "truth" and truth is not None}
-    out = []
-    for title, camera, pose in views:
-        kinds: dict[str, dict[str, Array]] = {kind: {} for kind in KINDS}
-        for name, mesh in shown.items():
-            kept = np.ones(len(mesh.triangles), bool) if cut is None else _facing(mesh, pose[:3, 3]) & _within(mesh, cut)
+    out = [MeshPictures(title, {"coloured": {}, "shape": {}, "distance": {}}) for title, _, _ in views]
+    for name, mesh in (("truth", truth), *meshes.items()):
+        if mesh is None or not len(mesh.triangles):
+            continue
+        middle, normal = mesh.vertices[mesh.triangles].mean(axis=1), mesh.facing(np.arange(len(mesh.triangles)))
+        gaps = None
+        if name != "truth" and truth is not None:
+            gap, _ = distances(middle, truth)
+            gaps = coloured(gap[None] / (ERROR_VOXELS * voxel_size), ERROR_COLOURS)[0]
+        for made, (_, camera, pose) in zip(out, views, strict=True):
+            away = pose[:3, 3] - middle
+            towards = (normal * away).sum(axis=1) / np.maximum(np.linalg.norm(away, axis=1), 1e-30)
+            kept = np.ones(len(middle), bool)
+            if cut is not None:
+                kept = (towards > 0) & np.all((middle >= cut[0]) & (middle <= cut[1]), axis=1)
             part = replace(mesh, triangles=mesh.triangles[kept])
-            kinds["shape"][name] = picture(part, camera, pose, _headlight(part, pose[:3, 3]))
+            # Grey, as lit from the eye and a little from above, either side alike.
+            light = np.clip(0.25 + 0.6 * np.abs(towards[kept]) + 0.15 * np.abs(normal[kept, 2]), 0, 1)
+            made.kinds["shape"][name] = picture(part, camera, pose, np.repeat(np.round(light * 235).astype(np.uint8)[:, None], 3, axis=1))
             if name != "truth":  # a true mesh has no colours of its own
-                kinds["coloured"][name] = picture(part, camera, pose)
-            if name in gaps:
-                kinds["distance"][name] = picture(part, camera, pose, gaps[name][kept])
-        out.append(MeshPictures(title, {kind: by_name for kind, by_name in kinds.items() if by_name}))
-    return out
+                made.kinds["coloured"][name] = picture(part, camera, pose)
+            if gaps is not None:
+                made.kinds["distance"][name] = picture(part, camera, pose, gaps[kept])
+    return [replace(made, kinds={kind: by_name for kind, by_name in made.kinds.items() if by_name}) for made in out]
 
 
 def picture(mesh: Mesh, camera: Intrinsics, pose: Array, triangle_colours: Array | None = None) -> Array:
@@ -88,32 +96,3 @@ def from_outside(
 def cut_box(centre: Array, half_size: Array) -> tuple[Array, Array]:
     """The box outside which nothing is shown from outside."""
     return centre - BEYOND * half_size, centre + BEYOND * half_size
-
-
-def _gap_colours(mesh: Mesh, truth: Mesh, voxel_size: float) -> Array:
-    """(T, 3) uint8: each triangle's middle by its distance from the truth."""
-    gap = distances(mesh.vertices[mesh.triangles].mean(axis=1), truth)
-    return coloured(gap[None] / (ERROR_VOXELS * voxel_size), ERROR_COLOURS)[0]
-
-
-def _towards(mesh: Mesh, eye: Array) -> Array:
-    """(T,) cosine between each triangle's normal and the direction to the eye."""
-    away = eye - mesh.vertices[mesh.triangles].mean(axis=1)
-    away /= np.maximum(np.linalg.norm(away, axis=1, keepdims=True), 1e-30)
-    return np.asarray((mesh.facing(np.arange(len(mesh.triangles))) * away).sum(axis=1))
-
-
-def _facing(mesh: Mesh, eye: Array) -> Array:
-    return np.asarray(_towards(mesh, eye) > 0)
-
-
-def _within(mesh: Mesh, box: tuple[Array, Array]) -> Array:
-    middle = mesh.vertices[mesh.triangles].mean(axis=1)
-    return np.asarray(np.all((middle >= box[0]) & (middle <= box[1]), axis=1))
-
-
-def _headlight(mesh: Mesh, eye: Array) -> Array:
-    """(T, 3) uint8 grey as lit from the eye and a little from above, either side alike."""
-    normal = mesh.facing(np.arange(len(mesh.triangles)))
-    light = 0.25 + 0.6 * np.abs(_towards(mesh, eye)) + 0.15 * np.abs(normal[:, 2])
-    return np.repeat(np.round(np.clip(light, 0, 1) * 235).astype(np.uint8)[:, None], 3, axis=1)

@@ -12,20 +12,20 @@ import trimesh
 
 from fieldfuse.camera import Array, Intrinsics
 from fieldfuse.errors import InputError
-from fieldfuse.evaluation.coverage import seen_points
-from fieldfuse.tone import encode, shares
+from fieldfuse.evaluation.score import in_image
 from fieldfuse.tsdf.mesh import Mesh, ray_scene
 
 SAMPLES = 200_000  # on each surface: F-scores of the same meshes then repeat within some thousandths
 VOXELS = (1, 2, 4)  # distances at which F-scores are given, in voxels
 MARGIN = 0.25  # voxels before a true point where the true surface itself does not hide it
 MOST_BYTES = 2 * 2**30
+AT_ONCE = 1 << 19  # rays
 
 Region = tuple[Array, Array]  # lowest and highest corner (3,)
 
 
 def read_mesh(path: Path | str) -> Mesh:
-    """The triangles of a .ply, .obj or .glb file, with vertex colours where there are any.
+    """The triangles of a .ply or .obj file, with vertex colours where there are any.
 
     Raises:
         InputError: missing, too large, damaged, or without triangles.
@@ -34,7 +34,10 @@ def read_mesh(path: Path | str) -> Mesh:
     try:
         if path.stat().st_size > MOST_BYTES:
             raise InputError(f"the mesh {path} is larger than the {MOST_BYTES / 2**30:.0f} GB that are read; thin it out")
-        mesh = _read_glb(path) if path.suffix.lower() == ".glb" else _read_other(path)
+        loaded = trimesh.load_mesh(path, process=False)
+        visual: Any = loaded.visual
+        colours = np.asarray(visual.vertex_colors)[:, :3] if visual.kind == "vertex" else None
+        mesh = Mesh.create(np.asarray(loaded.vertices), np.asarray(loaded.faces), colours)
     except OSError as error:
         raise InputError(f"cannot read the mesh {path}: {error.strerror or error}") from error
     except InputError:
@@ -46,39 +49,9 @@ def read_mesh(path: Path | str) -> Mesh:
     return mesh
 
 
-def _read_other(path: Path) -> Mesh:
-    loaded = trimesh.load_mesh(path, process=False)
-    visual: Any = loaded.visual
-    colours = np.asarray(visual.vertex_colors)[:, :3] if visual.kind == "vertex" else None
-    return Mesh.create(np.asarray(loaded.vertices), np.asarray(loaded.faces), colours)
-
-
-def _read_glb(path: Path) -> Mesh:
-    """All parts where the file puts them. Their vertices' colours are linear, and trimesh keeps them apart where a part has a material."""
-    scene: Any = trimesh.load_scene(str(path), process=False)
-    vertices, triangles, colours = [np.zeros((0, 3))], [np.zeros((0, 3), np.int64)], []
-    for node in scene.graph.nodes_geometry:
-        place, name = scene.graph[node]
-        part = scene.geometry[name]
-        if not isinstance(part, trimesh.Trimesh):
-            continue  # points and lines
-        visual: Any = part.visual
-        kept = visual.vertex_colors if visual.kind == "vertex" else visual.vertex_attributes.get("color")
-        if kept is not None:
-            colours.append(np.round(255 * encode(np.nan_to_num(shares(np.asarray(kept)[:, :3])))).astype(np.uint8))
-        triangles.append(np.asarray(part.faces) + sum(map(len, vertices)))
-        vertices.append(np.asarray(part.vertices) @ place[:3, :3].T + place[:3, 3])
-    whole = len(colours) > 0 and sum(map(len, colours)) == sum(map(len, vertices))
-    return Mesh.create(np.concatenate(vertices), np.concatenate(triangles), np.concatenate(colours) if whole else None)
-
-
-def surface_points(mesh: Mesh, count: int, seed: int = 0) -> Array:
-    """(count, 3) points spread evenly by area over a mesh, always the same ones for a seed; none for a mesh without area."""
-    return _spread(mesh, count, seed)[0]
-
-
-def _spread(mesh: Mesh, count: int, seed: int) -> tuple[Array, Array]:
-    """`surface_points`, and the triangle (count,) that each of them lies in."""
+def surface_points(mesh: Mesh, count: int, seed: int = 0) -> tuple[Array, Array]:
+    """(count, 3) points spread evenly by area over a mesh, and the triangle (count,) that each lies in; always the same for a seed, none
+    for a mesh without area."""
     areas = mesh.areas()
     total = float(areas.sum())
     if not total > 0:
@@ -93,13 +66,9 @@ def _spread(mesh: Mesh, count: int, seed: int) -> tuple[Array, Array]:
     return np.asarray((1 - root) * a + root * (1 - second) * b + root * second * c), triangle
 
 
-def distances(points: Array, mesh: Mesh) -> Array:
-    """(N,) distance of (N, 3) points to the nearest point of a mesh's surface, infinite when it has none."""
-    return _nearest(points, mesh)[0]
-
-
-def _nearest(points: Array, mesh: Mesh) -> tuple[Array, Array]:
-    """`distances`, and the triangle (N,) int64 that the nearest point lies in (0 when there is none)."""
+def distances(points: Array, mesh: Mesh) -> tuple[Array, Array]:
+    """(N,) distance of (N, 3) points to the nearest point of a mesh's surface, and the triangle (N,) int64 that this lies in; infinite and
+    0 when the mesh has no surface."""
     points = np.asarray(points, dtype=np.float64).reshape(-1, 3)
     if len(mesh.triangles) == 0:
         return np.full(len(points), np.inf), np.zeros(len(points), np.int64)
@@ -117,6 +86,32 @@ def inside(points: Array, region: Region | None) -> Array:
     return np.asarray(np.all((points >= region[0]) & (points <= region[1]), axis=1))
 
 
+def seen_points(points: Array, mesh: Mesh, cameras: Sequence[Intrinsics], world_from_camera: Array, margin: float) -> Array:
+    """(N,) bool: which (N, 3) points on the surface of `mesh` some camera sees, inside its image and with nothing of the mesh before it.
+
+    Args:
+        cameras: one a pose (N, 4, 4); lenses are ignored.
+        margin: length before a point where the surface itself does not hide it; some tenths of a voxel.
+    """
+    points = np.asarray(points, dtype=np.float64).reshape(-1, 3)
+    seen = np.zeros(len(points), bool)
+    if len(points) == 0 or len(mesh.triangles) == 0:
+        return seen
+    origin = mesh.bounds().mean(axis=0)  # float32 rays start near zero, wherever the scene lies
+    scene = ray_scene(mesh, origin)
+    for camera, pose in zip(cameras, np.asarray(world_from_camera, dtype=np.float64), strict=True):
+        unseen = np.flatnonzero(~seen)
+        inside = unseen[in_image(points[unseen], camera, pose)]
+        for start in range(0, len(inside), AT_ONCE):
+            part = inside[start : start + AT_ONCE]
+            away = points[part] - pose[:3, 3]
+            distance = np.linalg.norm(away, axis=1, keepdims=True)
+            rays = np.concatenate([np.broadcast_to(pose[:3, 3] - origin, away.shape), away / np.maximum(distance, 1e-12)], axis=1)
+            hit = scene.cast_rays(o3c.Tensor.from_numpy(rays.astype(np.float32)))["t_hit"].numpy()
+            seen[part] = hit >= distance[:, 0] - margin
+    return seen
+
+
 def seen_surface(
     truth: Mesh,
     cameras: Sequence[Intrinsics],
@@ -125,7 +120,7 @@ def seen_surface(
     region: Region | None = None,
     samples: int = SAMPLES,
 ) -> tuple[Array, float]:
-    """Points of the true surface that a reconstruction is asked for: those that some camera saw, in the region.
+    """Points of the true surface that a reconstruction should have: those that some camera saw, in the region.
 
     Returns:
         (N, 3) points, and their share of the whole true surface.
@@ -133,7 +128,7 @@ def seen_surface(
     Raises:
         InputError: the cameras saw nothing of it, so mesh and poses do not belong together.
     """
-    points = surface_points(truth, samples)
+    points, _ = surface_points(truth, samples)
     kept = inside(points, region)
     kept[kept] = seen_points(points[kept], truth, cameras, world_from_camera, MARGIN * voxel_size)
     if not kept.any():
@@ -163,11 +158,11 @@ def geometry_metrics(
         `precision_n` and `recall_n`, the shares of both within that distance, and `f_score_n`, their harmonic mean; `voxel_size`.
         Without a surface: accuracy None, scores 0.
     """
-    own, triangle = _spread(mesh, samples, 1)
+    own, triangle = surface_points(mesh, samples, 1)
     kept = inside(own, region)
     own, triangle = own[kept], triangle[kept]
-    to_truth, nearest = _nearest(own, truth)
-    to_mesh = distances(wanted, mesh)
+    to_truth, nearest = distances(own, truth)
+    to_mesh, _ = distances(wanted, mesh)
     close = to_truth <= VOXELS[-1] * voxel_size
     alike = np.abs((mesh.facing(triangle[close]) * truth.facing(nearest[close])).sum(axis=1))
     out: dict[str, Any] = {

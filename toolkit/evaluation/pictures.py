@@ -1,4 +1,4 @@
-"""Pictures for people: truth, rendering, error and depth of held-out views, as tiles for the report and as labelled strips on disk.
+"""Pictures for people: truth, render, error and depth of held-out views, as tiles for the pages.
 
 Error maps have one fixed scale everywhere; depth maps have one range a run, so that tiles can be compared with each other.
 """
@@ -13,9 +13,9 @@ import numpy as np
 
 from fieldfuse.camera import Array
 from fieldfuse.capture.types import Views
-from fieldfuse.evaluation.depth import has_depth
-from fieldfuse.evaluation.pixels import as_float
+from fieldfuse.evaluation.metrics import as_float, has_depth
 from fieldfuse.evaluation.score import RenderedView, as_photo, entry
+from fieldfuse.export.surface import spread
 from fieldfuse.stereo.transients import LeftOut
 
 ERROR_TOP = 0.2  # mean absolute difference of the three channels, in [0, 1], that gets the brightest colour
@@ -23,7 +23,6 @@ ERROR_COLOURS = cv2.COLORMAP_INFERNO
 DEPTH_COLOURS = cv2.COLORMAP_TURBO
 TINT = (235, 40, 60)  # of what was left out
 MISSING = (128, 128, 128)  # neutral grey: no depth, or no truth to compare with
-
 
 
 @dataclass(frozen=True)
@@ -91,13 +90,6 @@ def depth_picture(depth: Array, limits: tuple[float, float] | None) -> Array:
     return picture
 
 
-def spread(count: int, most: int) -> list[int]:
-    """At most `most` of `count` indices, evenly spread, first and last among them."""
-    if count <= most:
-        return list(range(count))
-    return sorted({round(i) for i in np.linspace(0, count - 1, most)})
-
-
 def depth_error_picture(depth: Array, truth: Array, top: float) -> Array:
     """|d − d*| on a scale of 0 … `top`, (H, W, 3) uint8; grey where either depth is missing."""
     known = has_depth(depth) & has_depth(truth)
@@ -153,11 +145,3 @@ def method_pictures(
             tiles[name] = Tiles(render, error_picture(rgb, truth, valid), depth_picture(depth, limits), off)
         out.append(ViewPictures(views.names[index], truth, tiles, None if sensor is None else depth_picture(sensor, limits)))
     return Pictures(out, limits, unit, len(indices) - len(chosen))
-
-
-# --------------------------------------------------------------------------------------------------- strips
-
-
-def colour_bar(width: int, height: int, colours: int) -> Array:
-    """(height, width, 3) uint8: the colour map from low (left) to high (right)."""
-    return coloured(np.broadcast_to(np.linspace(0, 1, width), (height, width)), colours)

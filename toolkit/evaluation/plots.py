@@ -9,15 +9,13 @@ from __future__ import annotations
 import io
 import re
 import warnings
-from collections.abc import Sequence
 from typing import Any
 
 import matplotlib
-import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
-from fieldfuse.evaluation.words import duration, memory
+from fieldfuse.evaluation import words
 
 # Colours that matplotlib draws with → what stands in the SVG.
 INK, QUIET, LINE, ACCENT, SECOND, PALE = "#010101", "#020202", "#030303", "#040404", "#050505", "#060606"
@@ -31,7 +29,6 @@ CSS = {
 }
 SANS = "system-ui, -apple-system, 'Segoe UI', 'Helvetica Neue', Arial, sans-serif"
 LONGEST_NAME = 24  # letters
-LABEL_LONG, LABEL_TALL = 0.35, 0.1  # shares of the axes that the name of a level takes, with what keeps it clear of its line
 METADATA: dict[str, Any] = dict.fromkeys(("Creator", "Date", "Format", "Type"))
 
 
@@ -95,59 +92,16 @@ def psnr_over_time(timeline: list[dict[str, Any]], levels: dict[str, float | Non
         fontsize=10,
         weight="bold",
     )
-    known = [(name, level) for name, level in (levels or {}).items() if level is not None]
-    for _, level in known:
-        axes.axhline(level, color=SECOND, linewidth=1.2, dashes=(4, 3))
+    known = {name: level for name, level in (levels or {}).items() if level is not None}
+    for name, level in known.items():
+        axes.axhline(level, color=SECOND, linewidth=1.2, dashes=(4, 3) if name == "TSDF" else (1, 2), label=f"{name} {level:.1f}")
     axes.margins(x=0.02, y=0.14)
     axes.set_xlim(left=0)
-    for (name, level), (right, above) in zip(known, label_places(seconds, values, [level for _, level in known], axes), strict=True):
-        end: dict[str, Any] = {"xycoords": ("axes fraction", "data"), "textcoords": "offset points", "xytext": (0, 4 if above else -4)}
-        side: dict[str, Any] = {"ha": "right" if right else "left", "va": "bottom" if above else "top"}
-        axes.annotate(f"{name} {level:.1f}", (right, level), color=SECOND, fontsize=9.5, **end, **side)
+    if known:
+        axes.legend(frameon=False, fontsize=9.5, labelcolor=SECOND, loc="best")  # where it covers no curve
     axes.set_xlabel("seconds of fitting", color=QUIET, fontsize=9.5)
     axes.set_ylabel("PSNR on test views (dB)", color=QUIET, fontsize=9.5)
     return _svg(figure, "PSNR on test views over seconds of fitting", "time")
-
-
-def label_places(seconds: Sequence[float], values: Sequence[float], levels: list[float], axes: Axes) -> list[tuple[bool, bool]]:
-    """For the name of each level (at the right end, above its line): the first place that no curve, line or other text crosses."""
-    (_, width), (low, high) = axes.get_xlim(), axes.get_ylim()
-    tall = LABEL_TALL * (high - low)
-    taken = [(True, values[-1] + tall / 3)]  # the curve's last value
-    side = np.linspace(0, LABEL_LONG * width, 32)
-    along = {True: width - side[::-1], False: side}
-    out = []
-    for level in levels:
-        for right, above in ((True, True), (False, True), (True, False), (False, False)):
-            bottom = level if above else level - tall
-            curve = np.interp(along[right], seconds, values, left=np.nan, right=np.nan)
-            lines = [other for other in levels if other != level and bottom < other < bottom + tall]
-            names = [end for end, other in taken if end == right and abs(other - bottom) < tall]
-            inside = low <= bottom and bottom + tall <= high
-            if inside and not lines and not names and not ((curve > bottom) & (curve < bottom + tall)).any():
-                break
-        else:
-            right, above, bottom = True, True, level
-        taken.append((right, bottom))
-        out.append((right, above))
-    return out
-
-
-def shown_name(stage: dict[str, Any]) -> str:
-    """A stage's name, shortened so that the bars keep their room, and with no formula for matplotlib to find in it."""
-    name = str(stage.get("name") or "")
-    name = name if len(name) <= LONGEST_NAME else name[: LONGEST_NAME - 1] + "…"
-    return name.replace("$", r"\$")
-
-
-def bar_label(stage: dict[str, Any]) -> str:
-    """Time and memory of a stage in a few words."""
-    parts = [duration(stage["seconds"])]
-    if stage.get("peak_memory_mb") is not None:
-        parts.append(memory(stage["peak_memory_mb"]))
-    if stage.get("cached"):
-        parts.append("reused")
-    return ", ".join(parts)
 
 
 def stage_bars(stages: list[dict[str, Any]]) -> str | None:
@@ -159,9 +113,15 @@ def stage_bars(stages: list[dict[str, Any]]) -> str | None:
     seconds = [max(0.0, float(stage["seconds"])) for stage in known]
     places = list(range(len(known)))
     bars = axes.barh(places, seconds, color=[PALE if stage.get("cached") else ACCENT for stage in known], height=0.62)
-    labels = [bar_label(stage) for stage in known]
+    labels, names = [], []
+    for stage in known:
+        memory = words.memory(stage["peak_memory_mb"]) if stage.get("peak_memory_mb") is not None else ""
+        labels.append(", ".join(filter(None, (words.duration(stage["seconds"]), memory, "reused" if stage.get("cached") else ""))))
+        name = str(stage.get("name") or "")
+        name = name if len(name) <= LONGEST_NAME else name[: LONGEST_NAME - 1] + "…"
+        names.append(name.replace("$", r"\$"))  # no formula for matplotlib to find
     axes.bar_label(bars, labels=labels, padding=5, color=INK, fontsize=9.5)
-    axes.set_yticks(places, labels=[shown_name(stage) for stage in known], color=INK)
+    axes.set_yticks(places, labels=names, color=INK)
     axes.invert_yaxis()
     axes.spines["bottom"].set_visible(False)
     axes.set_xticks([])

@@ -54,7 +54,7 @@ def lens(width: int, height: int) -> Intrinsics:
 
 
 def sphere_pixels(side: int = 96, seed: int = 0, count: int = 8) -> PixelPool:
-    """Pixels of random colour in `count` square pictures: what is fitted does not matter, only what it takes."""
+    """Pixels of random colour in `count` square images: what is fitted does not matter, only what it takes."""
     generator = np.random.default_rng(seed)
     poses = around(count)
     images = [generator.integers(0, 256, (side, side, 3), dtype=np.uint8) for _ in poses]

@@ -1,76 +1,52 @@
-"""What `fieldfuse tradeoff` leaves: `tradeoff.csv`, plots as PNG, and `tradeoff.html`: one file, no script, nothing from elsewhere."""
+"""What `fieldfuse tradeoff` leaves: `tradeoff.json`, `tradeoff.csv`, plots as PNG, and `tradeoff.html` with all of it."""
 
 from __future__ import annotations
 
-import base64
 import csv
 import io
+import warnings
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
-from fieldfuse import __version__
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+from matplotlib.ticker import FuncFormatter, LogLocator, NullFormatter
+
 from fieldfuse.evaluation import words
-from fieldfuse.evaluation.page import flat, short_name, subtitle
-from fieldfuse.evaluation.report import CAPTURE, POSES, STAGE, plain
-from fieldfuse.evaluation.templates import template
-from fieldfuse.evaluation.tradeoff import AXES, COSTS, MEASURES, METHODS, NUMBERS, Point, checked_row, in_order, pareto, points_of
-from fieldfuse.evaluation.tradeoff_plots import quality_plot
-from fieldfuse.evaluation.tradeoff_text import AXIS_TITLES, Step, front_sentence, sentence, setting_text, steps
-from fieldfuse.files import atomic_path, write_json
+from fieldfuse.evaluation.page import render, uri
+from fieldfuse.evaluation.report import write_page
+from fieldfuse.evaluation.tradeoff import (
+    AXES,
+    COSTS,
+    MEASURES,
+    METHODS,
+    NUMBERS,
+    Point,
+    front_sentence,
+    in_order,
+    pareto,
+    points_of,
+    sentence,
+    series,
+    setting_text,
+    steps,
+    tradeoff_data,
+)
+from fieldfuse.files import atomic_path
 
-CSV = "tradeoff.csv"
-JSON = "tradeoff.json"
-HTML = "tradeoff.html"
-PLOTS = "tradeoff"  # folder of the PNG files
-TEMPLATE = "tradeoff.html.j2"
-COST_WORDS = {"seconds": "time", "memory_mb": "memory"}
+# Method → colour, marker, and the axis whose points a curve joins.
+STYLES = {
+    "field": ("#1763c6", "o", "iterations"),
+    "field_per_sample": ("#7a4fc4", "D", "iterations"),
+    "direct": ("#1d8a5a", "^", "keyframes"),
+    "tsdf": ("#c2570c", "s", "voxel_size"),
+    "tsdf_stereo": ("#c2570c", "s", "voxel_size"),
+}
+INK, QUIET, LINE = "#18212c", "#5c6979", "#dfe5eb"
+COST_TITLES = {"seconds": "seconds that the method alone takes", "memory_mb": "memory beyond the libraries"}
 
-
-def tradeoff_data(data: dict[str, Any]) -> dict[str, Any]:
-    """`data` in the fixed form of `tradeoff.json`, plain JSON; applying it twice changes nothing.
-
-    Raises:
-        InputError: a row is not a measured point.
-    """
-    data = plain(data)
-    known = {
-        "version": data.get("version") or __version__,
-        **{key: data.get(key) for key in ("command", "created", "source", "unit", "scene")},
-        "warnings": [str(warning) for warning in data.get("warnings") or []],
-        "capture": {**dict.fromkeys(CAPTURE), **(data.get("capture") or {})},
-        "poses": {**dict.fromkeys(POSES), **(data.get("poses") or {})},
-        "stages": [{**dict.fromkeys(STAGE), **stage} for stage in data.get("stages") or []],
-        "rows": [checked_row(row) for row in data.get("rows") or []],
-        "left_out": [str(name) for name in data.get("left_out") or []],
-        "refused": [str(text) for text in data.get("refused") or []],
-        "settings": data.get("settings") or {},
-        "machine": data.get("machine") or {},
-    }
-    return {**known, **{key: value for key, value in data.items() if key not in known}}
-
-
-def csv_text(rows: Sequence[dict[str, Any]]) -> str:
-    """One line a row: method, setting, seed, seconds by stage, memory, size, scores, load; empty where not known."""
-    stages = list(dict.fromkeys(stage for row in rows for stage in row["stages"]))
-    out = io.StringIO()
-    writer = csv.writer(out, lineterminator="\n")
-    settings = [*AXES, "resolution"]
-    loads = ["load_before", "load_after"]
-    writer.writerow(["id", "method", "axes", *settings, "seed", *(f"seconds_{stage}" for stage in stages), *NUMBERS, *loads, "error"])
-    for row in rows:
-        seconds = [_cell(row["stages"].get(stage)) for stage in stages]
-        load = [*(row["load"] or []), None, None][:2]
-        kept = [_cell(row["setting"].get(key)) for key in settings]
-        numbers = [_cell(row[key]) for key in NUMBERS]
-        writer.writerow(
-            [row["id"], row["method"], " ".join(row["axes"]), *kept, row["seed"], *seconds, *numbers, *map(_cell, load), row["error"]]
-        )
-    return out.getvalue()
-
-
-def _cell(value: Any) -> Any:
-    return "" if value is None else float(f"{value:.6g}") if isinstance(value, float) else value
+Plots = dict[tuple[str, str], bytes]  # measure, cost → PNG
 
 
 def write_tradeoff(folder: Path | str, data: dict[str, Any]) -> dict[str, Any]:
@@ -80,88 +56,146 @@ def write_tradeoff(folder: Path | str, data: dict[str, Any]) -> dict[str, Any]:
         InputError: a row is not a measured point.
         OutputError: the folder is not writable or the disk is full.
     """
-    folder = Path(folder)
-    data = tradeoff_data(data)
+    folder, data = Path(folder), tradeoff_data(data)
     points = points_of(data["rows"])
-    plots = {}
+    files, plots = {"tradeoff.csv": csv_text(data["rows"]).encode()}, Plots()
     for measure in MEASURES:
-        for cost in COSTS:
-            picture = quality_plot(points, cost, measure)
-            if picture is not None:
-                plots[measure, cost] = picture
-                _write(folder / PLOTS / f"{measure}_over_{COST_WORDS[cost]}.png", picture)
-    _write(folder / CSV, csv_text(data["rows"]).encode())
-    write_json(folder / JSON, data)
-    _write(folder / HTML, render_tradeoff(data, points, plots).encode())
+        for cost, title in COSTS.items():
+            if (plot := quality_plot(points, cost, measure)) is not None:
+                plots[measure, cost] = files[f"tradeoff/{measure}_over_{title}.png"] = plot
+    for name, content in files.items():
+        with atomic_path(folder / name) as temporary:
+            temporary.write_bytes(content)
+    write_page(folder, "tradeoff", data, render_tradeoff(data, points, plots))
     return data
 
 
-def _write(path: Path, content: bytes) -> None:
-    with atomic_path(path) as temporary:
-        temporary.write_bytes(content)
+def csv_text(rows: Sequence[dict[str, Any]]) -> str:
+    """One line a row: method, setting, seed, seconds by stage, memory, size, scores, load; empty where not known."""
+    stages = list(dict.fromkeys(stage for row in rows for stage in row["stages"]))
+    settings = [*AXES, "resolution"]
+    head = ["id", "method", "axes", *settings, "seed", *(f"seconds_{stage}" for stage in stages), *NUMBERS]
+    head += ["load_before", "load_after", "error"]
+    out = io.StringIO()
+    writer = csv.writer(out, lineterminator="\n")
+    writer.writerow(head)
+    for row in rows:
+        cells = [row["id"], row["method"], " ".join(row["axes"]), *(row["setting"].get(key) for key in settings), row["seed"]]
+        cells += [row["stages"].get(stage) for stage in stages]
+        cells += [*(row[key] for key in NUMBERS), *[*(row["load"] or []), None, None][:2], row["error"]]
+        writer.writerow([float(f"{cell:.6g}") if isinstance(cell, float) else cell for cell in cells])
+    return out.getvalue()
 
 
-def render_tradeoff(data: dict[str, Any], points: Sequence[Point], plots: dict[tuple[str, str], bytes]) -> str:
+def render_tradeoff(data: dict[str, Any], points: Sequence[Point], plots: Plots) -> str:
     """The page as text. `data` as `tradeoff_data` answers it."""
     unit = data["unit"] or "units"
-    sections = [
-        (
-            MEASURES[measure][0],
-            [
-                (f"{MEASURES[measure][0]} over {COST_WORDS[cost]}", png_uri(plots[measure, cost]))
-                for cost in COSTS
-                if (measure, cost) in plots
-            ],
-        )
-        for measure in MEASURES
-    ]
+    sections = []
+    for measure, about in MEASURES.items():
+        shown = [(f"{about.title} over {title}", uri("png", plots[measure, c])) for c, title in COSTS.items() if (measure, c) in plots]
+        sections += [(about.title, shown)] if shown else []
+    notes = list(data["warnings"])
+    if missing := data["left_out"]:
+        are = "setting is" if len(missing) == 1 else "settings are"
+        notes.append(f"{len(missing)} {are} not measured yet ({', '.join(missing)}); the same command goes on.")
+    notes += [f"{METHODS[row['method']]} ({row['id']}): {row['error']}" for row in data["rows"] if row["error"] is not None]
+    headline = []
+    for method, title in METHODS.items():
+        if front := pareto([point for point in points if point.method == method]):
+            best = front[-1].mean
+            headline.append((words.decimal(best["psnr"], 1), f"dB in {words.duration(best['seconds'])}", f"{title}, at its best"))
+    by_axis = {axis: [sentence(step, unit) for step in steps(points) if step[0] == axis] for axis in AXES}
     fronts = {cost: {point.id for point in pareto(points, cost)} for cost in COSTS}
+    rows = [
+        {
+            "title": METHODS[point.method],
+            "setting": setting_text(point, unit),
+            "seeds": point.seeds,
+            "mean": {**dict.fromkeys(NUMBERS), **point.mean},
+            "spread": point.spread,
+            "front": [title for cost, title in COSTS.items() if point.id in fronts[cost]],
+        }
+        for point in in_order(points)
+    ]
     loads = [value for row in data["rows"] for value in row["load"] or [] if value is not None]
-    return template(TEMPLATE).render(
-        data=data,
-        title=short_name(data["source"]) or "Trade-off",
-        subtitle=subtitle(data),
-        headline=headline(points),
-        sentences=[text for cost in COSTS if (text := front_sentence(points, cost, "psnr", unit)) is not None],
-        sections=[(name, shown) for name, shown in sections if shown],
-        steps=step_groups(steps(points), unit),
-        rows=[point_row(point, fronts, unit) for point in in_order(points)],
-        failed=[row for row in data["rows"] if row["error"] is not None],
-        methods=METHODS,
-        depth="depth_error" in {key for point in points for key in point.mean},
+    return render(
+        "tradeoff.html.j2",
+        data,
+        "Trade-off",
+        warnings=notes,
+        headline=headline,
+        sentences=[text for cost in COSTS if (text := front_sentence(points, cost, unit)) is not None],
+        sections=sections,
+        steps=[(AXES[axis][0], texts) for axis, texts in by_axis.items() if texts],
+        rows=rows,
+        depth=any("depth_error" in point.mean for point in points),
         shared=sum(stage["seconds"] or 0 for stage in data["stages"]),
         loads=(min(loads), max(loads)) if loads else None,
-        settings=flat(data["settings"]),
     )
 
 
-def png_uri(picture: bytes) -> str:
-    return "data:image/png;base64," + base64.b64encode(picture).decode("ascii")
+def quality_plot(points: Sequence[Point], cost: str, measure: str) -> bytes | None:
+    """A PNG of `measure` over `cost` (log axis) with error bars over seeds; None when fewer than two points have both.
+
+    Curves join the points of a method's main axis (fitting time, voxel size, key frames); hollow marks are steps along other axes. The
+    dark line is the Pareto front.
+    """
+    known = [point for point in points if cost in point.mean and measure in point.mean and point.mean[cost] > 0]
+    if len(known) < 2:
+        return None
+
+    def at(some: Sequence[Point]) -> tuple[list[float], list[float]]:
+        return [point.mean[cost] for point in some], [point.mean[measure] for point in some]
+
+    figure = Figure(figsize=(7.2, 4.6), layout="constrained", facecolor="white")
+    axes = figure.add_subplot()
+    ends = [point.mean[cost] + sign * point.spread.get(cost, 0.0) for point in known for sign in (-1, 0, 1)]
+    _frame(axes, cost, measure, [value for value in ends if value > 0])
+    front = at(pareto(known, cost, measure))
+    dashed: dict[str, Any] = {"linewidth": 1.0, "linestyle": (0, (4, 2)), "alpha": 0.75, "label": "Pareto front"}
+    axes.step(*front, where="post", color=INK, zorder=2, **dashed)
+    for method in dict.fromkeys(point.method for point in known):
+        colour, marker, axis = STYLES[method]
+        curve = max((line for along, line in series(known) if along == axis and line[0].method == method), key=len, default=[])
+        if curve:
+            x, y = at(curve)
+            dx, dy = ([point.spread.get(key, 0.0) for point in curve] for key in (cost, measure))
+            joined = "-" if x in (sorted(x), sorted(x, reverse=True)) else "none"  # a line back and forth would say nothing
+            line: dict[str, Any] = {"linestyle": joined, "color": colour, "marker": marker, "markersize": 5, "linewidth": 1.8, "zorder": 3}
+            bars = {"xerr": dx if any(dx) else None, "yerr": dy if any(dy) else None}
+            axes.errorbar(x, y, **bars, capsize=2.5, elinewidth=1, label=METHODS[method], **line)
+        if rest := [point for point in known if point.method == method and point not in curve]:
+            hollow: dict[str, Any] = {"facecolors": "none", "edgecolors": colour, "linewidths": 1.2, "zorder": 4}
+            axes.scatter(*at(rest), s=26, marker=marker, label=METHODS[method] + (", other settings" if curve else ""), **hollow)
+    axes.scatter(*front, s=110, facecolors="none", edgecolors=INK, linewidths=1.1, zorder=5)
+    figure.legend(frameon=False, fontsize=9, labelcolor=INK, loc="outside upper left", ncols=3, columnspacing=1.6)  # never over marks
+    buffer = io.BytesIO()
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", UserWarning)
+        figure.savefig(buffer, format="png", dpi=130, metadata={"Software": None})
+    return buffer.getvalue()
 
 
-def headline(points: Sequence[Point]) -> list[tuple[str, str, str]]:
-    """The large numbers on top: the best of each method."""
-    out = []
-    for method, title in METHODS.items():
-        front = pareto([point for point in points if point.method == method])
-        if front:
-            best = front[-1]
-            out.append((words.decimal(best.mean["psnr"], 1), f"dB in {words.duration(best.mean['seconds'])}", f"{title}, at its best"))
-    return out
+def _frame(axes: Axes, cost: str, measure: str, values: Sequence[float]) -> None:
+    axes.set_xscale("log")
+    for name, spine in axes.spines.items():
+        spine.set_visible(name in ("left", "bottom"))
+        spine.set_color(LINE)
+    axes.grid(color=LINE, linewidth=0.7)
+    axes.set_axisbelow(True)
+    axes.tick_params(colors=QUIET, labelsize=9, which="both", length=0)
 
+    def seconds(value: float) -> str:
+        return f"{value / 60:g} min" if value >= 60 and value % 60 == 0 else f"{value:g} s"
 
-def step_groups(found: Sequence[Step], unit: str) -> list[tuple[str, list[str]]]:
-    """Sentences under the titles of their axes."""
-    return [(AXIS_TITLES[axis], same) for axis in AXES if (same := [sentence(step, unit) for step in found if step.axis == axis])]
-
-
-def point_row(point: Point, fronts: dict[str, set[str]], unit: str) -> dict[str, Any]:
-    """What the page's table shows of a point."""
-    return {
-        "title": METHODS[point.method],
-        "setting": setting_text(point, unit),
-        "seeds": point.seeds,
-        "mean": {**dict.fromkeys(NUMBERS), **point.mean},
-        "spread": point.spread,
-        "front": [COST_WORDS[cost] for cost in COSTS if point.id in fronts[cost]],
-    }
+    wide = max(values) / min(values) > 8
+    axes.xaxis.set_major_locator(LogLocator(subs=(1.0, 3.0) if wide else (1.0, 1.5, 2.0, 3.0, 5.0, 7.0)))
+    axes.xaxis.set_major_formatter(FuncFormatter(lambda value, _: seconds(value) if cost == "seconds" else words.memory(value)))
+    axes.xaxis.set_minor_formatter(NullFormatter())
+    axes.set_xlim(min(values) / 1.25, max(values) * 1.25)
+    axes.margins(y=0.08)
+    axes.set_xlabel(COST_TITLES[cost], color=QUIET, fontsize=9.5)
+    about = MEASURES[measure]
+    title = f"{about.title} ({about.unit})" if about.unit else about.title
+    better = "higher" if about.larger_is_better else "lower"
+    axes.set_ylabel(f"{title} on test views, {better} is better", color=QUIET, fontsize=9.5)

@@ -59,7 +59,7 @@ def duration(seconds: float | None) -> str:
 
 
 def _two(total: int, large: str, small: str) -> str:
-    """60 of the small unit make a large one; none of it is not told."""
+    """60 of the small unit make a large one; none of it is not shown."""
     return f"{total // 60} {large}" + (f" {total % 60} {small}" if total % 60 else "")
 
 

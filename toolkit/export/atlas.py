@@ -37,7 +37,7 @@ class Atlas:
     way: Array
 
     def coordinates(self) -> Array:
-        """(T, 3, 2) float64 texture coordinates of the vertices, (0, 0) the lower left corner of the picture, as OBJ and OpenGL have it."""
+        """(T, 3, 2) float64 texture coordinates of the vertices, (0, 0) the lower left corner of the image, as OBJ and OpenGL have it."""
         reach = (self.length * self.way)[:, None]
         first = self.corner + 0.5
         second, third = first + reach * np.array([1.0, 0.0]), first + reach * np.array([0.0, 1.0])

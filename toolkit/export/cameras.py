@@ -33,7 +33,7 @@ def write_cameras(
     well, which the json names as other programs look for it.
 
     Args:
-        names: of the pictures; COLMAP ends a name at a space, so spaces become underscores there.
+        names: of the images; COLMAP ends a name at a space, so spaces become underscores there.
         intrinsics: one each, lens included.
         world_from_camera: (N, 4, 4) in OpenCV axes.
         points, colours: (P, 3) sparse points and their colours (None: grey).

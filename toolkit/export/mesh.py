@@ -56,7 +56,7 @@ def write_mesh(path: Path | str, mesh: Mesh, working_from_input: Similarity | No
 def write_textured(path: Path | str, mesh: Mesh, atlas: Atlas, texture: Array, working_from_input: Similarity | None = None) -> None:
     """Write a mesh with its texture (S, S, 3) uint8 as one .glb file; frames and axes as in `write_mesh`.
 
-    What is lit is in the pictures already, so the material is marked as one that takes no light (KHR_materials_unlit).
+    What is lit is in the images already, so the material is marked as one that takes no light (KHR_materials_unlit).
 
     Raises:
         InputError: an empty mesh.
@@ -79,7 +79,7 @@ def write_textured(path: Path | str, mesh: Mesh, atlas: Atlas, texture: Array, w
     solid = trimesh.Trimesh(vertices, triangles, visual=visual, process=False)
 
     def put_picture(buffers: dict[Any, bytes], tree: dict[str, Any]) -> None:
-        """In place of what trimesh makes of the picture, which it packs again, worse."""
+        """In place of what trimesh makes of the image, which it packs again, worse."""
         data = packed.getvalue()
         buffers[list(buffers)[tree["images"][0]["bufferView"]]] = data + bytes(-len(data) % 4)
 

@@ -1,7 +1,7 @@
 """`field.html`: a baked field and what draws it in one file, for whatever browser has WebGL 2: to walk through, to keep, to send.
 
 The page holds only what cannot be worked out (occupied voxels, a byte of density and sixteen of features a corner, the decoder), deflated;
-the scripts in `web/` unpack it and march through it as `backends/numba/baked.py` does. It asks no server for anything.
+the scripts in `web/` unpack it and march through it as `backends/numba/march.py` does. It asks no server for anything.
 """
 
 from __future__ import annotations
@@ -21,22 +21,19 @@ import numpy as np
 from jinja2 import Environment, StrictUndefined
 
 from fieldfuse import __version__
-from fieldfuse.backends.numba.baked import CORNERS, FINER
 from fieldfuse.camera import Array, Intrinsics
 from fieldfuse.errors import InputError
 from fieldfuse.files import atomic_path
 from fieldfuse.nerfusion.decoder import Deferred
 from fieldfuse.nerfusion.encoding import BEHIND, DIRECTION, SH
-from fieldfuse.render.bake import BakedField
+from fieldfuse.render.bake import FINER, BakedField
 from fieldfuse.render.field import Field
 from fieldfuse.render.march import MAX_STRETCH
 from fieldfuse.tone import SHOULDER
-from fieldfuse.volume.topology import VOXELS
 
 CHANNELS, HIDDEN = 16, 96  # at most: what lies in one word of four, and, in thirds, in uniform blocks of 16 kB
 WHOLE = 12  # hidden units are a multiple of it: three parts of rows, four units a vector
 INPUTS = CHANNELS + DIRECTION  # of the decoder: features and harmonics
-CHUNK = 512  # blocks at a time
 NEAREST_DEPTH, FARTHEST_DEPTH = 0.6, 2.5  # of the median depth: the range of depth's colours
 SCRIPTS = ("unpack.js", "draw.js", "walk.js", "page.js")
 
@@ -110,17 +107,14 @@ def page(field: BakedField, tour: Tour, title: str) -> str:
 
 
 def packed(field: BakedField, tour: Tour) -> tuple[dict[str, Any], bytes]:
-    """What the scripts are told, and the arrays one after the other, each filled up to whole words."""
+    """What the scripts need to know, and the arrays one after the other, each filled up to whole words."""
     arrays = field.arrays
-    slots = np.argwhere(arrays.table >= 0)  # z, y, x
-    keys = np.empty((len(arrays.base), 3), np.uint16)
-    keys[arrays.table[tuple(slots.T)]] = slots[:, ::-1]
     small, large = decoder_blocks(field)
     given: list[tuple[str, Array]] = [
         ("bits", np.ascontiguousarray(arrays.bits).view(np.uint8)),
-        ("keys", keys),
+        ("keys", (field.keys() - field.table_origin).astype(np.uint16)),
         ("bricks", arrays.bricks),
-        ("density", corner_densities(field)),
+        ("density", field.corner_densities()),
         ("feature", _padded(np.asarray(arrays.feature), CHANNELS, 1)),
         ("thickness", arrays.thickness.astype("<f4")),
         ("small", small.astype("<f4")),
@@ -134,27 +128,6 @@ def packed(field: BakedField, tour: Tour) -> tuple[dict[str, Any], bytes]:
     about = _about(field, tour)
     about["arrays"] = [[name, f"{array.dtype.kind}{array.dtype.itemsize}", array.size] for name, array in given]
     return about, bytes(blob)
-
-
-def corner_densities(field: BakedField) -> Array:
-    """(R,) uint8 quantised raw density of every stored corner, in the order of `Baked.feature`."""
-    arrays = field.arrays
-    occupied = np.unpackbits(np.ascontiguousarray(arrays.bits).view(np.uint8), axis=1, bitorder="little").astype(bool)
-    stored = (arrays.rows[:, :, None] >> np.arange(CORNERS) & 1).astype(bool).reshape(len(occupied), -1)
-    out, done = np.empty(field.corners, np.uint8), 0
-    for start in range(0, len(occupied), CHUNK):
-        part = occupied[start : start + CHUNK]
-        first = int(arrays.first[start, 0])
-        eight = np.asarray(arrays.packed[first : first + int(part.sum())]).view(np.uint8).reshape(-1, 8)
-        grid = np.zeros((len(part), CORNERS, CORNERS, CORNERS), np.uint8)
-        slot, cell = np.nonzero(part.reshape(-1, VOXELS))
-        z, y, x = cell >> 6, cell >> 3 & 7, cell & 7
-        for corner in range(8):
-            grid[slot, z + (corner >> 2), y + (corner >> 1 & 1), x + (corner & 1)] = eight[:, corner]
-        values = grid.reshape(len(part), -1)[stored[start : start + CHUNK]]
-        out[done : done + len(values)] = values
-        done += len(values)
-    return out
 
 
 def _width(field: BakedField) -> int:

@@ -2,10 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable
+from collections.abc import Iterable
 from fractions import Fraction
 from pathlib import Path
-from typing import Protocol
 
 import cv2
 import numpy as np
@@ -16,21 +15,13 @@ from fieldfuse.errors import InputError, OutputError
 from fieldfuse.files import atomic_path
 from fieldfuse.tsdf.mesh import as_bytes
 
-QUALITY = "18"  # constant rate factor of H.264: hardly to be told from what was rendered
+QUALITY = "18"  # constant rate factor of H.264: hardly different from what was rendered
 SMPTE_170M, BT_709, LIMITED = 6, 1, 1  # ITU-T H.273: the matrix that both writers use, what is nearest to sRGB, 16 … 235
 PROBE = 2**16  # bytes
 
 
-class Writer(Protocol):
-    """Takes (H, W, 3) uint8 RGB pictures with even sides."""
-
-    def write(self, picture: Array) -> None: ...
-
-    def close(self) -> None: ...
-
-
 class H264:
-    """Through PyAV, whose wheels bring x264."""
+    """Takes (H, W, 3) uint8 RGB pictures with even sides, through PyAV, whose wheels bring x264."""
 
     def __init__(self, path: Path, size: tuple[int, int], fps: float) -> None:
         import av
@@ -56,7 +47,7 @@ class H264:
 
 
 class OpenCV:
-    """The pip wheels of OpenCV carry no H.264 encoder."""
+    """The same through OpenCV, whose pip wheels carry no H.264 encoder."""
 
     def __init__(self, path: Path, size: tuple[int, int], fps: float, codec: str) -> None:
         self._writer = cv2.VideoWriter(str(path), cv2.CAP_FFMPEG, cv2.VideoWriter.fourcc(*codec), fps, size)
@@ -73,11 +64,7 @@ class OpenCV:
 
 # In order of preference. H.264 takes hundredths of a second a picture. VP9 in mp4 is what browsers play, at some tenths of a second a
 # picture; MPEG-4 part 2 is everywhere, a hundred times as fast, and plays in desktop players only.
-CODECS: dict[str, Callable[[Path, tuple[int, int], float], Writer]] = {
-    "avc1": H264,
-    "vp09": lambda path, size, fps: OpenCV(path, size, fps, "vp09"),
-    "mp4v": lambda path, size, fps: OpenCV(path, size, fps, "mp4v"),
-}
+CODECS = ("avc1", "vp09", "mp4v")
 
 
 def write_video(path: Path | str, frames: Iterable[Array], fps: float = 30.0, codec: str = "auto") -> str:
@@ -100,7 +87,7 @@ def write_video(path: Path | str, frames: Iterable[Array], fps: float = 30.0, co
     shape = np.asarray(first).shape
     with atomic_path(path) as temporary:
         temporary.touch()  # OpenCV's writer cannot say why a file cannot be made; this can
-        writer, used = _open(temporary, shape, fps, tuple(CODECS) if codec == "auto" else (codec,))
+        writer, used = _open(temporary, shape, fps, CODECS if codec == "auto" else (codec,))
         try:
             writer.write(_even(first, shape, path))
             count = 1
@@ -125,11 +112,11 @@ def frame_count(path: Path) -> int:
         reader.release()
 
 
-def _open(path: Path, shape: tuple[int, ...], fps: float, codecs: Iterable[str]) -> tuple[Writer, str]:
+def _open(path: Path, shape: tuple[int, ...], fps: float, codecs: Iterable[str]) -> tuple[H264 | OpenCV, str]:
     size = (shape[1] + shape[1] % 2, shape[0] + shape[0] % 2)
     for codec in codecs:
         try:
-            return CODECS[codec](path, size, fps), codec
+            return H264(path, size, fps) if codec == "avc1" else OpenCV(path, size, fps, codec), codec
         except (ImportError, ValueError):  # not there
             continue
     path.write_bytes(bytes(PROBE))  # a full disk is no fault of the codec, and this says what it is

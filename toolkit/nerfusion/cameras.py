@@ -31,9 +31,9 @@ class Cameras:
     @classmethod
     def of(cls, intrinsics: Sequence[Intrinsics], world_from_camera: Array, device: torch.device | str = "cpu") -> Cameras:
         """From the toolkit's cameras; lenses are not looked at (images are undistorted before)."""
-        lenses = np.array([(c.fx, c.fy, c.cx, c.cy) for c in intrinsics], np.float32)
-        sizes = np.array([(c.width, c.height) for c in intrinsics], np.float32)
-        return cls(*map(torch.from_numpy, (lenses, sizes, np.asarray(world_from_camera).astype(np.float32)))).to(device)
+        lenses = torch.tensor([(c.fx, c.fy, c.cx, c.cy) for c in intrinsics], dtype=torch.float32)
+        sizes = torch.tensor([(c.width, c.height) for c in intrinsics], dtype=torch.float32)
+        return cls(lenses, sizes, torch.from_numpy(np.asarray(world_from_camera).astype(np.float32))).to(device)
 
     @classmethod
     def same_size(cls, intrinsics: Tensor, world_from_camera: Tensor, width: int, height: int) -> Cameras:
@@ -56,7 +56,8 @@ class Cameras:
         hosts = [part.host for part in parts if part.host is not None]
         if hosts and len(hosts) == len(parts):
             return cls.together(hosts).to(parts[0].intrinsics.device)
-        return cls(*(torch.cat([getattr(part, name) for part in parts]) for name in ("intrinsics", "size", "world_from_camera")))
+        lenses, sizes = torch.cat([part.intrinsics for part in parts]), torch.cat([part.size for part in parts])
+        return cls(lenses, sizes, torch.cat([part.world_from_camera for part in parts]))
 
     def to(self, device: torch.device | str) -> Cameras:
         """The same cameras on another device, in one piece."""
@@ -68,7 +69,8 @@ class Cameras:
         parts = self.intrinsics, self.size, self.world_from_camera
         flat = torch.cat([part.reshape(-1) for part in parts])
         moved = (to_device_async(flat.numpy(), device) if on_cpu else flat.to(device)).split([part.numel() for part in parts])
-        return Cameras(*(new.view(old.shape) for new, old in zip(moved, parts, strict=True)), self if on_cpu else None)
+        intrinsics, size, poses = (new.view(old.shape) for new, old in zip(moved, parts, strict=True))
+        return Cameras(intrinsics, size, poses, self if on_cpu else None)
 
     @property
     def positions(self) -> Tensor:

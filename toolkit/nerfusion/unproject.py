@@ -187,7 +187,7 @@ def look_up(views: Sequence[EncodedView], projection: Projection, step: Tensor) 
     values = *tables, projection.pixels, step, projection.footprint
     learning = torch.is_grad_enabled() and any(rows.requires_grad for rows in tables)
     if (kernels := dispatch.kernels("feature_lookup", *values)) and not (learning and dispatch.is_cpu(step.device)):
-        return kernels.look_up(views, projection.pixels, step, projection.footprint, COLOURED)  # type: ignore[no-any-return]
+        return kernels.look_up(views, projection.pixels, step, projection.footprint, COLOURED)
     parts = []
     for view, pixels, footprint in zip(views, projection.pixels, projection.footprint, strict=True):
         fine = [view.features.lookup(pixels, step), view.colours.lookup(pixels, step)]

@@ -14,7 +14,7 @@ LEVEL = 0.25  # eigenvalue ratio below which the cameras' x axes lie in a plane 
 ORBIT = 0.05  # the same for camera centres: they lie in a plane
 AGREE = 15.0  # degrees between two estimates that count as one
 NEAR = 60.0  # degrees that an estimate may lie off the mean up vector of the cameras
-TURNED = 0.01  # least share of the x axes' second direction: about 6° of turning
+TURNING = 0.01  # least share of the x axes' second direction: about 6° of turning
 UNDECIDED = 0.15  # length of a mean of unit vectors below which it points nowhere
 SHORT = 0.5  # and below which it does not overrule the x axes
 STEEP = 0.7  # cosine between a camera's axis and up above which that axis has no heading
@@ -54,7 +54,7 @@ def up_direction(world_from_camera: Array, given: tuple[float, float, float] | N
     level = vectors[:, 0]
     # Cameras that look straight down have their up vectors in the ground plane: then up is where they stand.
     level = _towards(level, mean if abs(level @ mean) > UNDECIDED else behind)
-    turned = values[0] < LEVEL * values[1] and values[1] > TURNED
+    turned = values[0] < LEVEL * values[1] and values[1] > TURNING
     if turned and (length < SHORT or _degrees(level, mean / length) < NEAR):
         up, reason = level, "direction across the cameras' x axes (held level)"
     elif length > UNDECIDED:

@@ -1,8 +1,4 @@
-"""`baked.safetensors`: a baked field on disk, rendered from where it lies.
-
-Tensors carry the names of `baked.Baked` and `decoder.<name>` of `common.Decoder`. Densities and features, nearly all of the file,
-stay windows into it and are read page by page as rays come to them. Every index is copied and checked, because compiled code follows it.
-"""
+"""`baked.safetensors`: a baked field on disk. Tensors carry the names of `Baked`, and `decoder.<name>` those of `common.Decoder`."""
 
 from __future__ import annotations
 
@@ -12,17 +8,15 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import torch
 from safetensors import SafetensorError, safe_open
 from safetensors.numpy import save
 
 from fieldfuse.backends.numba import common as K
-from fieldfuse.backends.numba.baked import CORNERS, FINER, LEVELS, Baked
 from fieldfuse.camera import Similarity
 from fieldfuse.errors import InputError, OutputError, all_lines, first_line
 from fieldfuse.files import atomic_path
 from fieldfuse.nerfusion.encoding import DIRECTION
-from fieldfuse.render.bake import BakedField
+from fieldfuse.render.bake import FINER, LEVELS, Baked, BakedField, counted, occupied_voxels
 from fieldfuse.render.sky import checked_sky
 from fieldfuse.volume.space import Space
 
@@ -31,20 +25,7 @@ VERSION = 1
 METADATA_KEY = "fieldfuse.baked"
 MAX_METADATA_BYTES = 2**20
 MOST_CHANNELS, MOST_HIDDEN = 1024, 4096
-MAPPED = ("packed", "feature")  # any content of these is harmless
-KINDS = {
-    "table": torch.int32,
-    "bricks": torch.uint8,
-    "bits": torch.uint8,
-    "first": torch.int32,
-    "packed": torch.uint8,
-    "rows": torch.int32,
-    "base": torch.int32,
-    "feature": torch.uint8,
-    "thickness": torch.float32,
-    "scale": torch.float32,
-    "low": torch.float32,
-}
+KINDS = {"table": "<i4", "first": "<i4", "rows": "<i4", "base": "<i4", **dict.fromkeys(("bricks", "bits", "packed", "feature"), "|u1")}
 
 
 def write_baked(path: Path | str, field: BakedField, working_from_input: Similarity | None = None) -> None:
@@ -77,7 +58,7 @@ def write_baked(path: Path | str, field: BakedField, working_from_input: Similar
 
 
 def read_baked(path: Path | str) -> BakedField:
-    """Open and check a baked field that may come from anybody. The file must not be changed while it is in use.
+    """Read and check a baked field that may come from anybody.
 
     Raises:
         InputError: missing, damaged, of another version, or any index that could not have been written.
@@ -86,16 +67,16 @@ def read_baked(path: Path | str) -> BakedField:
     if not path.is_file():
         raise InputError(f"there is no baked field {path}; make it with `fieldfuse bake`")
     try:
-        with safe_open(str(path), framework="pt", device="cpu") as source:
+        with safe_open(str(path), framework="numpy") as source:
             text = (source.metadata() or {}).get(METADATA_KEY, "")
             _require(0 < len(text) <= MAX_METADATA_BYTES, "it is not a baked field")
-            names = set(source.keys())
-            decoder_names = {f"decoder.{name}" for name in K.Decoder._fields}
-            _require(names == set(KINDS) | decoder_names, "its tensors are not those of a baked field")
-            tensors = {name: source.get_tensor(name) for name in names}
-        for name, tensor in tensors.items():
-            _require(tensor.dtype == KINDS.get(name, torch.float32), f"its tensor {name!r} has the type {tensor.dtype}")
-        arrays = {name: tensor.numpy() if name in MAPPED else tensor.clone().numpy() for name, tensor in tensors.items()}
+            names = {*Baked._fields, *(f"decoder.{name}" for name in K.Decoder._fields)}
+            _require(set(source.keys()) == names, "its tensors are not those of a baked field")
+            arrays = {name: source.get_tensor(name) for name in names}
+        for name, array in arrays.items():
+            _require(array.dtype.str == KINDS.get(name, "<f4"), f"its tensor {name!r} has the type {array.dtype}")
+            finite = array.dtype.kind != "f" or bool(np.isfinite(array).all())
+            _require(finite, f"its tensor {name!r} holds values that are not finite")
         return _checked(arrays, json.loads(text))
     except (_Unusable, SafetensorError, OSError, ValueError, TypeError, KeyError, RuntimeError, OverflowError, RecursionError) as error:
         raise InputError(f"{path} cannot be used, because {all_lines(error)}; bake the run again") from error
@@ -117,67 +98,46 @@ def _checked(arrays: dict[str, Array], about: dict[str, Any]) -> BakedField:
     numbers = (*space.centre, space.half, space.shell, *space.box, near)
     sane = all(math.isfinite(v) for v in numbers) and space.half > 0 and 0 <= space.shell <= 16 and near >= 0
     _require(sane and 8 <= resolution <= 8192 and 1 <= fine <= 64, "a setting is out of range")
-    x, y, z = (int(v) for v in about["table_origin"])
-    _require(max(abs(v) for v in (x, y, z)) <= resolution, "its block table lies outside the lattice")
     background = np.array([float(v) for v in about["background"]], np.float32)
     _require(background.shape == (3,) and bool(np.isfinite(background).all()), "its background is not a colour")
     sky = checked_sky(about.get("sky"))
-    _check_arrays(arrays, resolution)
-    channels = arrays["feature"].shape[1]
-    hidden = len(arrays["decoder.b1"])
-    _require(1 <= hidden <= MOST_HIDDEN, "its decoder is too wide")
-    inputs = channels + DIRECTION
-    shapes = {"w1": (inputs, hidden), "w1_out": (hidden, inputs), "b1": (hidden,), "w2": (hidden, hidden), "w2_out": (hidden, hidden)}
-    shapes |= {"b2": (hidden,), "w3": (3, hidden), "b3": (3,)}
-    for name, shape in shapes.items():
-        _require(arrays[f"decoder.{name}"].shape == shape, f"its decoder tensor {name!r} has another shape")
-    for name, array in arrays.items():
-        _require(array.dtype != np.float32 or bool(np.isfinite(array).all()), f"its tensor {name!r} holds values that are not finite")
-    baked = Baked(**{name: arrays[name] for name in Baked._fields if name not in ("bits", "packed")}, **_words(arrays))
-    decoder = K.Decoder(*(arrays[f"decoder.{name}"] for name in K.Decoder._fields))
-    return BakedField(space, resolution, near, fine, (x, y, z), background, baked, decoder, None if sky is None else sky.numpy())
-
-
-def _words(arrays: dict[str, Array]) -> dict[str, Array]:
-    return {"bits": arrays["bits"].view("<u8"), "packed": arrays["packed"].view("<u8").reshape(-1)}
-
-
-def _check_arrays(arrays: dict[str, Array], resolution: int) -> None:
-    """Shapes, and that no index leads outside what it points into."""
     blocks, voxels, stored = len(arrays["base"]), len(arrays["packed"]), len(arrays["feature"])
-    channels = arrays["feature"].shape[-1]
-    side = resolution // 4 + 2
+    channels, hidden = arrays["feature"].shape[-1], len(arrays["decoder.b1"])
+    _require(1 <= channels <= MOST_CHANNELS, f"it has {channels} feature channels")
+    _require(1 <= hidden <= MOST_HIDDEN, "its decoder is too wide")
+    side, inputs = resolution // 4 + 2, channels + DIRECTION
     shapes = {
         "bricks": (side, side, side),
         "bits": (blocks, 64),
-        "first": (blocks, 8),
         "packed": (voxels, 8),
-        "rows": (blocks, CORNERS * CORNERS),
-        "base": (blocks,),
         "feature": (stored, channels),
         "thickness": (LEVELS * FINER + 1,),
         "scale": (channels,),
         "low": (channels,),
+        "decoder.w1": (inputs, hidden),
+        "decoder.w1_out": (hidden, inputs),
+        "decoder.b1": (hidden,),
+        "decoder.w2": (hidden, hidden),
+        "decoder.w2_out": (hidden, hidden),
+        "decoder.b2": (hidden,),
+        "decoder.w3": (3, hidden),
+        "decoder.b3": (3,),
     }
     for name, shape in shapes.items():
         _require(arrays[name].shape == shape, f"its tensor {name!r} has the shape {arrays[name].shape} where {shape} belongs")
-    _require(1 <= channels <= MOST_CHANNELS, f"it has {channels} feature channels")
-    table = arrays["table"]
-    _require(table.ndim == 3 and table.size > 0 and int(table.min()) >= -1 and int(table.max()) < blocks, "its block table leads nowhere")
-    occupied = np.unpackbits(arrays["bits"], axis=1, bitorder="little").reshape(-1, 8, 8, 8).astype(bool)
-    counts = occupied.reshape(-1, 64).sum(1, dtype=np.int64)
-    _require(
-        bool((arrays["first"].reshape(-1) == np.cumsum(counts) - counts).all()) and counts.sum() == voxels, "its voxels are miscounted"
-    )
-    # Corner rows: as many bits as corners, counted in order; and beside every occupied voxel all eight are there.
-    rows = arrays["rows"]
-    mask = (rows[:, :, None] >> np.arange(CORNERS) & 1).astype(bool)
-    here = mask.sum(2)
-    total = here.sum(1)
-    right = bool((rows >> CORNERS == np.cumsum(here, 1) - here).all()) and int(total.sum()) == stored
-    _require(right and bool((arrays["base"] == np.cumsum(total) - total).all()), "its corners are miscounted")
-    cube = mask.reshape(-1, CORNERS, CORNERS, CORNERS)
-    for z in (0, 1):
-        for y in (0, 1):
-            for x in (0, 1):
-                _require(bool(cube[:, z : z + 8, y : y + 8, x : x + 8][occupied].all()), "a voxel lacks a corner")
+    # Indices: all of them follow from which voxels are occupied, and every block has one place in the lattice.
+    table, occupied = arrays["table"], occupied_voxels(arrays["bits"])
+    placed = table.ndim == 3 and np.array_equal(np.sort(table[table >= 0]), np.arange(blocks)) and int(table.min(initial=-1)) >= -1
+    _require(placed, "its block table leads nowhere")
+    first, rows, base, total = counted(occupied)
+    same = all(np.array_equal(arrays[name], values) for name, values in (("first", first), ("rows", rows), ("base", base)))
+    _require(same and total == stored and int(occupied.sum()) == voxels, "its voxels or corners are miscounted")
+    words = {"bits": arrays["bits"].view("<u8"), "packed": arrays["packed"].view("<u8").reshape(-1)}
+    baked = Baked(**{name: arrays[name] for name in Baked._fields if name not in words}, **words)
+    decoder = K.Decoder(*(arrays[f"decoder.{name}"] for name in K.Decoder._fields))
+    x, y, z = (int(v) for v in about["table_origin"])
+    sky_array = None if sky is None else sky.numpy()
+    field = BakedField(space, resolution, near, fine, (x, y, z), background, baked, decoder, sky_array)
+    keys = field.keys()
+    _require(keys.min(initial=0) >= 0 and keys.max(initial=0) <= resolution // 8, "a block lies outside the lattice")
+    return field

@@ -18,7 +18,7 @@ KEY_CAMERAS = 12
 ARC_MARGIN = 0.02
 
 
-def orbit(world_from_camera: Array, centre: Array | None = None, frames: int = 90) -> Array:
+def orbit(world_from_camera: Array, centre: Array, frames: int = 90) -> Array:
     """A smooth closed path of `frames` poses, (F, 4, 4) in OpenCV axes, that stays near the (N, 4, 4) captured cameras.
 
     - Cameras that look the same way: an ellipse in their plane, about as wide as they are spread, looking at one point.
@@ -26,16 +26,20 @@ def orbit(world_from_camera: Array, centre: Array | None = None, frames: int = 9
     - Everything else (rooms seen from inside, walks): smoothly through some of the cameras and back.
 
     Args:
-        centre: (3,) of what is looked at; None: the point nearest to all viewing axes.
+        centre: (3,) of what is looked at.
 
     Raises:
         InputError: no cameras, or fewer than one frame.
     """
-    poses = _checked(world_from_camera, frames)
+    poses = np.asarray(world_from_camera, dtype=np.float64).reshape(-1, 4, 4)
+    if len(poses) == 0:
+        raise InputError("a camera path needs at least one camera, there is none; pass the poses of the capture")
+    if frames < 1:
+        raise InputError(f"a camera path needs at least one frame, not {frames}; raise export.video_frames")
     if len(poses) == 1:
         return np.repeat(poses, frames, axis=0)
     positions, forward = poses[:, :3, 3], poses[:, :3, 2]
-    target = focus(poses) if centre is None else np.asarray(centre, dtype=np.float64)
+    target = np.asarray(centre, dtype=np.float64)
     phase = 2 * np.pi * np.arange(frames) / frames
     if np.linalg.norm(forward.mean(axis=0)) > FACING:
         return _before(poses, target, phase)
@@ -46,31 +50,8 @@ def orbit(world_from_camera: Array, centre: Array | None = None, frames: int = 9
     return _along(_keys(poses[_tour(positions)]), (1 - np.cos(phase)) / 2)
 
 
-def interpolate(poses: Array, frames: int) -> Array:
-    """(F, 4, 4) rigid poses, evenly paced, through the (N, 4, 4) given ones from the first to the last.
-
-    Positions and quaternions follow cubic Hermite curves whose knots are spaced by distance moved and angle turned (slopes from
-    neighbours, as in Catmull and Rom 1974), so velocity has no jumps.
-
-    Raises:
-        InputError: no poses, or fewer than one frame.
-    """
-    return _along(_checked(poses, frames), np.linspace(0, 1, frames))
-
-
-def focus(world_from_camera: Array) -> Array:
-    """(3,) point with the least squared distance to all viewing axes; for parallel axes a point before the cameras' mean."""
-    forward, positions = world_from_camera[:, :3, 2], world_from_camera[:, :3, 3]
-    across = np.eye(3) - forward[:, :, None] * forward[:, None, :]  # (N, 3, 3) projection away from each axis
-    spread = np.linalg.norm(positions - positions.mean(axis=0), axis=1).mean()
-    prior = positions.mean(axis=0) + forward.mean(axis=0) * max(4 * spread, 1e-6)
-    # A weak pull towards the prior decides what parallel axes leave open.
-    matrix = across.sum(axis=0) + 1e-3 * len(positions) * np.eye(3)
-    return np.asarray(np.linalg.solve(matrix, np.einsum("nij,nj->i", across, positions) + 1e-3 * len(positions) * prior))
-
-
 def look_at(positions: Array, target: Array, up: Array) -> Array:
-    """(N, 4, 4) poses at (N, 3) positions that look at (3,) or (N, 3) targets, the picture's upper side towards `up`."""
+    """(N, 4, 4) poses at (N, 3) positions that look at (3,) or (N, 3) targets, the image's upper side towards `up`."""
     positions = np.asarray(positions, dtype=np.float64).reshape(-1, 3)
     forward = _unit(np.broadcast_to(target, positions.shape) - positions)
     right = np.cross(forward, up)
@@ -88,7 +69,7 @@ def _before(poses: Array, target: Array, phase: Array) -> Array:
     middle = np.median(positions, axis=0)
     right, down, forward = (_unit(poses[:, :3, axis].mean(axis=0)) for axis in range(3))
     offset = positions - middle
-    # The spread within which most cameras are: beyond them there are no pictures.
+    # The spread within which most cameras are: beyond them there are no images.
     width, height = (np.quantile(np.abs(offset @ axis), 0.7) for axis in (right, down))
     distance = max(float((target - middle) @ forward), 2 * width, 2 * height, 1e-6)
     at = middle + np.cos(phase)[:, None] * width * right + np.sin(phase)[:, None] * height * down
@@ -122,7 +103,11 @@ def _around(positions: Array, target: Array, up: Array, phase: Array) -> Array:
 
 
 def _along(poses: Array, share: Array) -> Array:
-    """Poses at `share` (F,) of the way through the keys."""
+    """Rigid poses at `share` (F,) of the way through the keys, evenly paced.
+
+    Positions and quaternions follow cubic Hermite curves whose knots are spaced by distance moved and angle turned (slopes from
+    neighbours, as in Catmull and Rom 1974), so velocity has no jumps.
+    """
     if len(poses) == 1:
         return np.repeat(poses, len(share), axis=0)
     positions, turns = poses[:, :3, 3], _quaternions(poses[:, :3, :3])
@@ -130,22 +115,17 @@ def _along(poses: Array, share: Array) -> Array:
     turned = 2 * np.arccos(np.clip((turns[1:] * turns[:-1]).sum(axis=1), -1, 1))
     pace = moved / max(moved.mean(), 1e-12) + turned / max(turned.mean(), 0.2)
     knots = np.concatenate([[0], np.cumsum(np.maximum(pace, 1e-3))])
-    curve = _hermite(knots, np.concatenate([positions, turns], axis=1), share * knots[-1])
+    values = np.concatenate([positions, turns], axis=1)
+    width = np.diff(knots)[:, None]
+    rise = np.diff(values, axis=0) / width
+    inner = (rise[:-1] * width[1:] + rise[1:] * width[:-1]) / (width[1:] + width[:-1])
+    # At the ends the slope of the parabola through the neighbour's slope and the first interval.
+    first, last = (2 * rise[0] - inner[0], 2 * rise[-1] - inner[-1]) if len(inner) else (rise[0], rise[-1])
+    curve = CubicHermiteSpline(knots, values, np.concatenate([first[None], inner, last[None]]))(share * knots[-1])
     out = np.tile(np.eye(4), (len(share), 1, 1))
     out[:, :3, :3] = Rotation.from_quat(curve[:, 3:]).as_matrix()
     out[:, :3, 3] = curve[:, :3]
     return out
-
-
-def _hermite(knots: Array, values: Array, at: Array) -> Array:
-    """(F, C) values of the cubic Hermite curve through (K, C) values, slopes weighted by the neighbouring intervals."""
-    width = np.diff(knots)[:, None]
-    rise = np.diff(values, axis=0) / width
-    inner = (rise[:-1] * width[1:] + rise[1:] * width[:-1]) / (width[1:] + width[:-1])
-    # At the ends the slope of the parabola that the neighbour's slope and the first interval ask for.
-    first, last = (2 * rise[0] - inner[0], 2 * rise[-1] - inner[-1]) if len(inner) else (rise[0], rise[-1])
-    slopes = np.concatenate([first[None], inner, last[None]])
-    return np.asarray(CubicHermiteSpline(knots, values, slopes)(at))
 
 
 def _keys(walk: Array) -> Array:
@@ -184,11 +164,3 @@ def _quaternions(rotations: Array) -> Array:
 def _unit(vectors: Array) -> Array:
     return np.asarray(vectors / np.maximum(np.linalg.norm(vectors, axis=-1, keepdims=True), 1e-12))
 
-
-def _checked(poses: Array, frames: int) -> Array:
-    poses = np.asarray(poses, dtype=np.float64).reshape(-1, 4, 4)
-    if len(poses) == 0:
-        raise InputError("a camera path needs at least one camera, there is none; pass the poses of the capture")
-    if frames < 1:
-        raise InputError(f"a camera path needs at least one frame, not {frames}; raise export.video_frames")
-    return poses

@@ -1,9 +1,9 @@
 """Colours finer than the shape they lie on: the networks' field, its colours looked up in the images on ever finer lattices.
 
 The networks work on voxels of some pixels, since sparse convolutions cost most of direct inference. Shape is smooth at that scale, colours
-are not, and to look them up (`render.recolour`) costs little at any scale. So voxels that the images see are divided, which leaves the
-field the function it was, and what the coarser lattice could not show is projected back to the finer one. Nothing is learned: it is a fixed
-number of weighted means, from coarse to fine.
+are not, and to look them up (`render.color_backprojection`) costs little at any scale. So voxels that the images see are divided, which
+leaves the field the function it was, and what the coarser lattice could not show is projected back to the finer one. Nothing is learned:
+it is a fixed number of weighted means, from coarse to fine.
 """
 
 from __future__ import annotations
@@ -16,8 +16,8 @@ import torch
 from fieldfuse import memory
 from fieldfuse.capture.types import Views
 from fieldfuse.progress import SILENT, Progress
+from fieldfuse.render.color_backprojection import recoloured
 from fieldfuse.render.field import Field
-from fieldfuse.render.recolour import recoloured
 from fieldfuse.training.levels import finer
 from fieldfuse.training.silhouettes import inside_silhouettes
 from fieldfuse.volume.edit import dilate

@@ -35,7 +35,7 @@ from tests.nerfusion.training.tiny import tiny_settings
 
 def choose(count: int, ordered: bool, kind: str, seed: int, views: int = 3, key_frames: int = 1, targets: int = 2) -> Any:
     """References and targets of a ring of cameras at a distance of 2."""
-    scene = SimpleNamespace(world_from_camera=ring(count), ordered=ordered, kind=kind, depth_hint=2.0)
+    scene: Any = SimpleNamespace(world_from_camera=ring(count), ordered=ordered, kind=kind, depth_hint=2.0)
     return choose_views(scene, np.random.default_rng(seed), PictureSettings(views=views, targets=targets), key_frames)
 
 

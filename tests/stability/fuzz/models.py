@@ -19,7 +19,7 @@ from fieldfuse.nerfusion.training.settings import load_train_settings
 from fieldfuse.nerfusion.weights import load_model, save_model
 from fieldfuse.render.bake import bake
 from fieldfuse.render.bake_file import read_baked, write_baked
-from fieldfuse.render.bake_image import BakedRenderer
+from fieldfuse.render.image import render_view
 from fieldfuse.simulate.settings import read_scene_file
 from fieldfuse.stereo.maps import load_stereo, save_stereo
 from fieldfuse.stereo.match import StereoDepth
@@ -40,12 +40,12 @@ def make_models(root: Path) -> None:
 
 def read_baked_field(root: Path, number: int) -> None:
     """Open a baked field and look at it from outside and from inside."""
-    renderer = BakedRenderer(read_baked(root / ("bounded.safetensors", "background.safetensors")[number % 2]), 1)
+    field = read_baked(root / ("bounded.safetensors", "background.safetensors")[number % 2]).to_field()
     camera = Intrinsics(12, 9, 10.0, 10.0, 6.0, 4.5)
     for distance in (3.0, 0.3):
         pose = np.eye(4)
         pose[:3, 3] = 0.1, -0.2, 0.3 - distance
-        picture = renderer.render(camera, pose)
+        picture = render_view(field, camera, pose)
         if not np.isfinite(picture.rgb).all():
             raise ValueError("a colour that is not finite")
 

@@ -98,13 +98,13 @@ def _report(root: Path) -> dict[str, Any]:
 def read_results(root: Path, number: int) -> None:
     """What the report and `info` make of them."""
     from fieldfuse.effects.correct import Corrections
-    from fieldfuse.evaluation.page import render_page
     from fieldfuse.evaluation.pictures import Pictures
-    from fieldfuse.evaluation.table import table
+    from fieldfuse.evaluation.report_page import render_page
+    from fieldfuse.evaluation.terminal import report_text
     from fieldfuse.pipelines.info import effects_facts
 
     data = _report(root)
-    str(table(data))
+    str(report_text(data))
     json.dumps(data, allow_nan=False)
     effects_facts(root, True)
     Corrections.from_dict(json.loads((root / "effects.json").read_text(encoding="utf-8"))["corrections"])
@@ -116,7 +116,8 @@ def make_measured(root: Path) -> None:
     """What `tradeoff`, `compare`, the benchmarks and runs of a total budget leave."""
     from benchmarks.protocols import SUITES
     from fieldfuse.evaluation.compare import compare_data
-    from fieldfuse.evaluation.tradeoff_page import csv_text, tradeoff_data
+    from fieldfuse.evaluation.tradeoff import tradeoff_data
+    from fieldfuse.evaluation.tradeoff_page import csv_text
     from tests.evaluation.test_compare_page import made
     from tests.evaluation.test_tradeoff import ladder
 
@@ -150,8 +151,8 @@ def read_measured(root: Path, number: int) -> None:
     """What the commands that go on from them, or show them, make of each."""
     from benchmarks.table import sections
     from fieldfuse.evaluation.compare import compare_data
-    from fieldfuse.evaluation.compare_text import comparison_text
-    from fieldfuse.evaluation.tradeoff_page import tradeoff_data
+    from fieldfuse.evaluation.terminal import comparison_text
+    from fieldfuse.evaluation.tradeoff import tradeoff_data
     from fieldfuse.pipelines import schemas
     from fieldfuse.pipelines.tradeoff_sweep import rows_at
 

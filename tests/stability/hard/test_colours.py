@@ -10,8 +10,8 @@ import torch
 from fieldfuse.camera import Array
 from fieldfuse.capture.types import Views
 from fieldfuse.evaluation.sphere import around, lens, sphere_field
+from fieldfuse.render.color_backprojection import COLOURS, MOST, recoloured
 from fieldfuse.render.composite import RAW_MAX
-from fieldfuse.render.recolour import COLOURS, MOST, recoloured
 from fieldfuse.render.sky import sky_colours
 from fieldfuse.training.background_sh import sky_behind
 from tests.stability.hard.errors import absolute, not_finite

@@ -12,8 +12,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from fieldfuse.camera import Array
-from fieldfuse.evaluation.depth import KEYS, depth_metrics
-from fieldfuse.evaluation.images import PSNR_CAP, psnr, ssim
+from fieldfuse.evaluation.metrics import DEPTH_KEYS, PSNR_CAP, depth_metrics, psnr, ssim
 from tests.stability.hard import reference
 from tests.stability.hard.ranges import QUICK
 from tests.stability.hard.within import Within
@@ -90,7 +89,7 @@ def test_depths(within: Within) -> None:
     within("the same depth: errors", sum(same[key] for key in ("abs_err", "abs_rel", "rmse", "median_rel")), 0.0)
     within("the same depth: shares below 1", sum(1 - same[key] for key in ("delta_1", "delta_2", "delta_3", "coverage")), 0.0)
     none = depth_metrics(truth, truth, np.zeros_like(truth, dtype=bool))
-    within("numbers for an empty mask", float(sum(none[key] is not None for key in KEYS)), 0.0)
+    within("numbers for an empty mask", float(sum(none[key] is not None for key in DEPTH_KEYS)), 0.0)
     mixed = truth.copy()
     mixed[0], mixed[1], mixed[2] = np.nan, np.inf, 0
     seen = depth_metrics(mixed, truth)

@@ -82,7 +82,7 @@ def project_back_pass(
 
     Args:
         tape: this thread's own `decode.Rays`.
-        limits: float32 stop and threshold of the march, and `STEEPEST` and `MOST` of `render.recolour`.
+        limits: float32 stop and threshold of the march, and `STEEPEST` and `MOST` of `render.color_backprojection`.
         marks: (M · 512,) uint16 for `march.mark`.
     """
     channels = len(space.width)

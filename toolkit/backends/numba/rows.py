@@ -82,29 +82,6 @@ def mix(context: Any, width: Any, table: Any, rows: Any, weights: Any, at: Any, 
 
 
 @cast(Any, intrinsic)
-def add_mixed_bytes(context: Any, width: Any, total: Any, table: Any, starts: Any, at: Any, weights: Any) -> Any:
-    """total (C,) += Σ_k weights[k] table[row k], of uint8 table (N, C): the eight rows are starts[at, 0 … 3] int32, each with the next one;
-    `weights` is a tuple of eight."""
-
-    def generate(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
-        own = _Rows(context, builder, signature, arguments)
-        small = ir.VectorType(ir.IntType(8), own.channels)
-        whole = ir.VectorType(ir.IntType(32), own.channels)
-        first = builder.mul(arguments[4], INDEX(4))
-        sums = own.read(own.pointer(1))
-        for corner, weight in enumerate(cgutils.unpack_tuple(builder, arguments[5], 8)):
-            pair = builder.sext(builder.load(builder.gep(own.data(3), [builder.add(first, INDEX(corner // 2))])), INDEX)
-            place = builder.mul(builder.add(pair, INDEX(corner % 2)), INDEX(own.channels))
-            steps = builder.load(builder.bitcast(builder.gep(own.data(2), [place]), small.as_pointer()), align=1)
-            values = builder.sitofp(builder.zext(steps, whole), own.vector)
-            sums = own.plus(own.times(own.everywhere(weight), values), sums)
-        own.write(sums, own.pointer(1))
-        return context.get_dummy_value()
-
-    return types.void(width, total, table, starts, types.int64, weights), generate
-
-
-@cast(Any, intrinsic)
 def add_to(context: Any, width: Any, total: Any, table: Any, at: Any, factor: Any) -> Any:
     """total (C,) += factor · table[at]."""
 

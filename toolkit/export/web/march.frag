@@ -1,4 +1,4 @@
-// One ray a pixel through the baked field: what `backends/numba/baked.py` does, in the same order and with the same numbers.
+// One ray a pixel through the baked field: what `backends/numba/march.py` does, in the same order and with the same numbers.
 // Out come the mean features of the ray (halves, two to a word), its depth and its opacity.
 
 uniform highp isampler3D blocks;     // block of 8³ voxels at a place of the table, -1: none

@@ -216,7 +216,7 @@ def _costs(descriptors: Sequence[Tensor], cameras: Cameras, inverses: Tensor, ra
     if len(cameras) == 1:
         return rays.new_zeros((len(rays), len(inverses)))
     if kernels := dispatch.kernels("plane_sweep", rays, cameras.intrinsics, *descriptors):
-        return kernels.costs(descriptors, cameras, inverses, rays, own, COLOUR_GAIN, UNKNOWN)  # type: ignore[no-any-return]
+        return kernels.costs(descriptors, cameras, inverses, rays, own, COLOUR_GAIN, UNKNOWN)
     parts = [rays.new_zeros((0, len(inverses)))]
     for ray, mine in zip(rays.split(AT_ONCE), own.split(AT_ONCE), strict=True):
         found = [_warped(descriptors[view], cameras, view, ray, inverses) for view in range(1, len(cameras))]
@@ -329,7 +329,7 @@ def measured(likely: Tensor, inverses: Tensor, depth: Tensor, shape: Sequence[in
 def _table(likely: Tensor, step: float) -> Tensor:
     """(D, h, w) likelihoods, farthest first → the table of a `DepthDistribution`."""
     if kernels := dispatch.kernels("plane_sweep", likely):
-        return kernels.table(likely, step, PEAK)  # type: ignore[no-any-return]
+        return kernels.table(likely, step, PEAK)
     nearer = likely.flip(0).cumsum(0).flip(0) - 0.5 * likely  # the surface lies anywhere about its plane
     middle = 0.5 * (nearer[1:] + nearer[:-1]) * step
     integral = torch.cat([torch.zeros_like(nearer[:1]), middle.cumsum(0)])

@@ -113,7 +113,7 @@ def smoothed(values: Sequence[float], window: int = SMOOTH) -> list[float]:
     sums = np.concatenate([[0.0], np.cumsum(np.asarray(values, dtype=np.float64))])
     ends = np.arange(1, len(sums))
     starts = np.maximum(ends - window, 0)
-    return ((sums[ends] - sums[starts]) / (ends - starts)).tolist()  # type: ignore[no-any-return]
+    return ((sums[ends] - sums[starts]) / (ends - starts)).tolist()
 
 
 def draw_curve(rows: Sequence[dict[str, float]], path: Path) -> None:

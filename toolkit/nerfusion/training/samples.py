@@ -55,12 +55,12 @@ class Pictures:
     ) -> Pictures:
         """V images (H, W, 3) uint8, cameras, (V, 4, 4) poses, and depths (H, W), None or not finite where unknown."""
         blank = np.zeros(images[0].shape[:2], np.float32)
-        depths = [blank if depth is None else np.nan_to_num(depth, posinf=0, neginf=0) for depth in depths]
+        filled = [blank if depth is None else np.nan_to_num(depth, posinf=0, neginf=0) for depth in depths]
         return cls(
             torch.stack([image.permute(2, 0, 1).float() / 255 for image in images]).contiguous(),
             torch.tensor([[c.fx, c.fy, c.cx, c.cy] for c in cameras], dtype=torch.float32),
             torch.from_numpy(world_from_camera.astype(np.float32)),
-            torch.from_numpy(np.stack(depths)).float(),
+            torch.from_numpy(np.stack(filled)).float(),
             background,
         )
 
@@ -69,8 +69,8 @@ class Pictures:
 
     def to(self, device: torch.device | str) -> Pictures:
         """The same images on another device."""
-        tensors = (self.images, self.intrinsics, self.world_from_camera, self.depths)
-        return Pictures(*(value.to(device) for value in tensors), self.background)
+        images, intrinsics, poses = self.images.to(device), self.intrinsics.to(device), self.world_from_camera.to(device)
+        return Pictures(images, intrinsics, poses, self.depths.to(device), self.background)
 
     def cameras(self, indices: Tensor) -> Cameras:
         """The networks' cameras of some images."""

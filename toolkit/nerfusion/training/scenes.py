@@ -13,6 +13,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import lru_cache
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import torch
@@ -106,8 +107,8 @@ def write_shard(
     count, _, height, width = images.shape
     if depths.shape != (count, height, width) or intrinsics.shape != (count, 4) or world_from_camera.shape != (count, 4, 4):
         raise ValueError("images, depths, cameras and poses of a shard must have as many entries and one size")
-    given = {"images": (images, np.uint8), "depths": (depths, np.float32), "intrinsics": (intrinsics, np.float32)}
-    given["world_from_camera"] = world_from_camera, np.float64
+    given: dict[str, tuple[Array, Any]] = {"images": (images, np.uint8), "depths": (depths, np.float32)}
+    given |= {"intrinsics": (intrinsics, np.float32), "world_from_camera": (world_from_camera, np.float64)}
     tensors = {name: torch.from_numpy(np.ascontiguousarray(values, dtype=dtype)) for name, (values, dtype) in given.items()}
     with atomic_path(path) as temporary:
         save_file(tensors, temporary, metadata={"format": FORMAT, "kind": kind, "ordered": str(int(ordered))})

@@ -1,7 +1,7 @@
-"""Colours of a field whose shape is known, looked up again in the pictures: one back-projection of what its own pictures lack.
+"""Colours of a field whose shape is known, looked up again in the images: one back-projection of what its own images lack.
 
 A voxel of a fused volume has the mean of what key frames showed at its corner. Corners lie up to a voxel before or behind the surface,
-where pictures from different sides show different things of it, so the mean is blurred by more than the voxel. Once the shape is there,
+where images from different sides show different things of it, so the mean is blurred by more than the voxel. Once the shape is there,
 every pixel's light is known to come from the samples of its ray, each by its weight; hidden ones get nothing of it.
 """
 
@@ -31,12 +31,12 @@ COLOURS = 3  # the first features are logits of the colour
 CHUNK = 2048  # rays at a time, in torch: what they meet then stays in the processor's cache …
 AT_ONCE = 16384  # … and on a device of its own, where it takes hundreds of launches whatever their number: 0.2 GB
 PER_VOXEL = 1.2  # rays along a voxel's side: 1.7 give 0.1 dB more for twice the time
-MOST_RAYS = 2_000_000  # pictures are left out evenly until there are no more …
+MOST_RAYS = 2_000_000  # images are skipped evenly until there are no more …
 MOST_WITHIN = 4_000_000  # … with alpha of those that show something: every side of an object is seen by few of them
 STEEPEST = 0.05  # least slope of colour over logit that is divided by
 MOST = 2.0  # logits that a ray may ask for
 VALID = 0.99
-BESIDE = 4  # pixels beside what a picture shows within which it asks for its background's colour, about three voxels
+BESIDE = 4  # pixels beside what an image shows within which its background's colour counts, about three voxels
 
 
 class Recoloured(NamedTuple):
@@ -75,18 +75,18 @@ def recoloured(
 ) -> Recoloured:
     """A field like `field` whose colours were looked up again.
 
-    For every corner n, over the rays r of the pictures, with a_rn the part of the ray's light that comes from it by the field's densities:
+    For every corner n, over the rays r of the images, with a_rn the part of the ray's light that comes from it by the field's densities:
 
         logit_n ← logit_n + ω Σ_r a_rn (c_r − ĉ_r) / ĉ'_r / Σ_r a_rn
 
-    c_r is what the picture shows, ĉ_r what the field shows there, ĉ'_r = ĉ (1 − ĉ) the slope of a colour over its logit. So what pictures
+    c_r is what the image shows, ĉ_r what the field shows there, ĉ'_r = ĉ (1 − ĉ) the slope of a colour over its logit. So what images
     agree on is right after one pass, and corners that no ray reaches keep every bit. Densities and decoder stay as they are.
 
     Args:
-        views: held-out ones are not looked at, nor masked pixels. Pictures with alpha ask for their background's colour where they are
+        views: held-out ones are not looked at, nor masked pixels. Images with alpha ask for their background's colour where they are
             see-through, up to `BESIDE` pixels from what they show: what bulges over a silhouette shows best what is behind it.
-        depth: at which a voxel's size in pixels tells how densely rays are taken, working units.
-        engine: auto | numba | torch. The compiled one runs on the CPU and knows the deferred decoder alone.
+        depth: at which a voxel's size in pixels decides how densely rays are taken, working units.
+        engine: auto | numba | torch. The compiled one runs on the CPU, with the deferred decoder alone.
         relaxation: ω. With 1 every corner gets what its rays ask for in the mean, which is too little where neighbours are asked for the
             opposite. Below 2, passes one after the other do not diverge where the way from logits to colours is straight (as in SIRT).
         in_place: the colours of `field` itself change, once all rays were asked: no second copy of its features is made.
@@ -185,23 +185,23 @@ class _Compiled:
 
 
 def _smaller(full: Intrinsics, focal: float) -> Intrinsics:
-    """The same camera with pictures of about this focal length in pixels, or its own if that is less."""
+    """The same camera with images of about this focal length in pixels, or its own if that is less."""
     shrink = min(1.0, focal / full.fx)
     return full.scaled(max(1, round(shrink * full.width)), max(1, round(shrink * full.height)))
 
 
 def _shown(views: Views, index: int, camera: Intrinsics) -> float:
-    """Pixels of a picture made as small as `camera` that are not see-through."""
+    """Pixels of an image made as small as `camera` that are not see-through."""
     alpha = views.alpha[index] if views.alpha else None
     return camera.width * camera.height * (1.0 if alpha is None else float(np.count_nonzero(alpha)) / alpha.size)
 
 
 def _pixels(views: Views, index: int, camera: Intrinsics) -> tuple[Tensor, Tensor, Tensor]:
-    """Origins, directions and colours (B, 3) of a picture made as small as `camera`, without what is masked, or see-through and more than
+    """Origins, directions and colours (B, 3) of an image made as small as `camera`, without what is masked, or see-through and more than
     `BESIDE` pixels from what is not."""
     shape = (camera.width, camera.height)
-    picture = cv2.resize(views.images[index], shape, interpolation=cv2.INTER_AREA).reshape(-1, COLOURS)
-    kept = np.ones(len(picture), bool)
+    image = cv2.resize(views.images[index], shape, interpolation=cv2.INTER_AREA).reshape(-1, COLOURS)
+    kept = np.ones(len(image), bool)
     mask = views.valid[index] if views.valid else None
     if mask is not None:
         kept &= cv2.resize(np.asarray(mask, np.float32), shape, interpolation=cv2.INTER_AREA).ravel() > VALID
@@ -210,4 +210,4 @@ def _pixels(views: Views, index: int, camera: Intrinsics) -> tuple[Tensor, Tenso
         near = cv2.dilate(cv2.resize(alpha, shape, interpolation=cv2.INTER_AREA), np.ones((2 * BESIDE + 1, 2 * BESIDE + 1), np.uint8))
         kept &= near.ravel() > 0
     origins, directions, _ = rays(camera, views.world_from_camera[index], pixel_grid(*shape)[kept])
-    return origins, directions, torch.from_numpy(picture[kept].astype(np.float32) / 255)
+    return origins, directions, torch.from_numpy(image[kept].astype(np.float32) / 255)

@@ -14,11 +14,11 @@ from fieldfuse.capture.types import Views
 from fieldfuse.errors import Interrupted
 from fieldfuse.evaluation.sphere import around, lens, sphere_field
 from fieldfuse.progress import Progress
+from fieldfuse.render.color_backprojection import BESIDE, COLOURS, MOST, STEEPEST, project_back, recoloured
 from fieldfuse.render.composite import SOLID, THRESHOLD
 from fieldfuse.render.field import Field
 from fieldfuse.render.image import render_view
 from fieldfuse.render.rays import render_with_gradients
-from fieldfuse.render.recolour import BESIDE, COLOURS, MOST, STEEPEST, project_back, recoloured
 from fieldfuse.volume.lookup import corners
 from tests.render.made import random_field, random_rays
 
@@ -197,7 +197,7 @@ def test_held_out_pictures_and_masked_pixels_are_not_looked_at() -> None:
 def test_rays_are_bounded_by_leaving_pictures_out(monkeypatch: pytest.MonkeyPatch) -> None:
     field = painted()
     views = pictures_of(field)
-    monkeypatch.setattr("fieldfuse.render.recolour.MOST_RAYS", 3 * 64 * 64)
+    monkeypatch.setattr("fieldfuse.render.color_backprojection.MOST_RAYS", 3 * 64 * 64)
     third = recoloured(grey(field), views, 100.0).field.feature_rows
     monkeypatch.undo()
     assert torch.equal(third, recoloured(grey(field), views.subset([0, 3, 6]), 100.0).field.feature_rows)
@@ -217,10 +217,10 @@ def test_with_alpha_the_rays_that_count_are_those_that_show_something(monkeypatc
     shown = sum(int(np.count_nonzero(alpha)) for alpha in views.alpha if alpha is not None)
     assert 0.1 < shown / (8 * 64 * 64) < 0.9
     everything = recoloured(grey(field), views, 100.0).field.feature_rows
-    monkeypatch.setattr("fieldfuse.render.recolour.MOST_RAYS", 1)  # that of captures without alpha
-    monkeypatch.setattr("fieldfuse.render.recolour.MOST_WITHIN", shown)
+    monkeypatch.setattr("fieldfuse.render.color_backprojection.MOST_RAYS", 1)  # that of captures without alpha
+    monkeypatch.setattr("fieldfuse.render.color_backprojection.MOST_WITHIN", shown)
     assert torch.equal(recoloured(grey(field), views, 100.0).field.feature_rows, everything)
-    monkeypatch.setattr("fieldfuse.render.recolour.MOST_WITHIN", shown - 1)
+    monkeypatch.setattr("fieldfuse.render.color_backprojection.MOST_WITHIN", shown - 1)
     half = recoloured(grey(field), views.subset([0, 2, 4, 6]), 100.0).field.feature_rows
     assert torch.equal(recoloured(grey(field), views, 100.0).field.feature_rows, half)
 

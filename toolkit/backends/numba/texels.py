@@ -1,32 +1,25 @@
-"""The texels of a texture, compiled: what a picture shows in them, their means, and their colours in the large.
+"""The texels of a texture, compiled: what an image shows in them, their means, and their colours in the large.
 
-All of them go through a triangle's half of its square in the texture, gutter included; see `atlas.Atlas` for `corner`, `length`, `way`.
+All of them go through a triangle's half of its square in the texture, gutter included; see `export.atlas.Atlas` for the layout `corner`,
+`length`, `way`.
 """
 
 from __future__ import annotations
 
-import numba
-import numpy as np
+from typing import Any
 
-from fieldfuse.camera import Array
+import numpy as np
+from numba import njit
 
 F = np.float32
+OPTIONS: Any = {"cache": True, "nogil": True, "error_model": "numpy"}
 
 
-@numba.njit(cache=True, nogil=True, error_model="numpy")
-def add_picture(
-    seen: Array,
-    corners: Array,
-    share: Array,
-    corner: Array,
-    length: Array,
-    way: Array,
-    image: Array,
-    matrix: Array,
-    texture: Array,
-    total: Array,
+@njit(**OPTIONS)
+def add_image(
+    seen: Any, corners: Any, share: Any, corner: Any, length: Any, way: Any, image: Any, matrix: Any, texture: Any, total: Any
 ) -> None:
-    """Add what a picture shows to the texels of the triangles `seen`, as much as `share` (T, 3) says of it at their vertices."""
+    """Add what an image shows to the texels of the triangles `seen`, by its `share` (T, 3) at their vertices."""
     height, width = image.shape[0], image.shape[1]
     one = F(1)
     for t in seen:
@@ -60,9 +53,9 @@ def add_picture(
                     texture[row, column, k] += amount * (upper * (one - down) + lower * down)
 
 
-@numba.njit(cache=True, nogil=True, error_model="numpy")
-def finish(corners: Array, colours: Array, corner: Array, length: Array, way: Array, texture: Array, total: Array, means: Array) -> None:
-    """Sums to means; texels that no picture shows get the colours (T, 3, 3) of their triangle's vertices. `means` (T, 3) of triangles."""
+@njit(**OPTIONS)
+def finish(corners: Any, colours: Any, corner: Any, length: Any, way: Any, texture: Any, total: Any, means: Any) -> None:
+    """Sums to means; texels that no image shows get the colours (T, 3, 3) of their triangle's vertices. `means` (T, 3) of triangles."""
     zero, one = F(0), F(1)
     for t in range(len(corners)):
         reach, count = length[t] + 3, 0
@@ -84,8 +77,8 @@ def finish(corners: Array, colours: Array, corner: Array, length: Array, way: Ar
             means[t, k] /= F(count)
 
 
-@numba.njit(cache=True, nogil=True, error_model="numpy")
-def shift(off: Array, corner: Array, length: Array, way: Array, texture: Array) -> None:
+@njit(**OPTIONS)
+def shift(off: Any, corner: Any, length: Any, way: Any, texture: Any) -> None:
     """Add to the texels of each triangle what lies between `off` (T, 3, 3) of its vertices."""
     one = F(1)
     for t in range(len(off)):
