@@ -130,8 +130,8 @@ def make_field(ground: Ground, spec: dict[str, Any], scratch: Path) -> list[Made
 
     settings, wanted = ground.settings, spec["wanted"]
     settings.fit = replace(settings.fit, budget=float(wanted["iterations"]), patience=False)
-    resolution, voxel = wanted_resolution(ground, float(wanted["voxel_size"]))
-    resolution = resolution if wanted["voxel_size"] != 1 else settings.field.resolution
+    wished, voxel = wanted_resolution(ground, float(wanted["voxel_size"]))
+    resolution = wished if wanted["voxel_size"] != 1 else settings.field.resolution
     settings.field = replace(settings.field, decoder=wanted["decoder"], resolution=resolution)
     path = scratch / "field.safetensors"
     with Cost(ground) as cost:

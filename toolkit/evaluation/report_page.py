@@ -43,7 +43,8 @@ def render_page(data: dict[str, Any], pictures: Pictures) -> str:
 
 def view_block(data: dict[str, Any], view: ViewPictures) -> dict[str, Any]:
     """What the template shows of a view: its name, the scores of each method, and a row of four captioned tiles for each."""
-    rows, scores = [], []
+    rows: list[Any] = []
+    scores: list[Any] = []
     for key, title in METHODS:
         if key not in view.methods:
             continue

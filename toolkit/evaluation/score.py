@@ -150,9 +150,9 @@ def compare_views(
         for one, index in zip(shown, chosen, strict=True):
             if index in true and scale is not None:
                 each.append(depth_accuracy(one.depth, true[index], scale, entry(views.valid, index)))
-        depth = {key: mean(one[key] for one in each) for key in ("abs_err", *WITHIN)}
+        errors = {key: mean(one[key] for one in each) for key in ("abs_err", *WITHIN)}
         score = score_views(shown, views, chosen, None if seconds is None else list(seconds[name]))
-        out[name] = score | {"on": on, "depth_scale": scale} | depth
+        out[name] = score | {"on": on, "depth_scale": scale} | errors
     return out
 
 
@@ -254,9 +254,9 @@ def nearest_image_scores(views: Views, indices: Sequence[int] | Array) -> dict[s
 
 def every_nth(camera: Intrinsics, step: int) -> Intrinsics:
     """The camera of an image's rows and columns 0, `step`, 2 `step`, …: the same rays, fewer of them."""
-    size = {"width": -(-camera.width // step), "height": -(-camera.height // step)}
-    centre = {"cx": (camera.cx - 0.5) / step + 0.5, "cy": (camera.cy - 0.5) / step + 0.5}
-    return replace(camera, fx=camera.fx / step, fy=camera.fy / step, **size, **centre)
+    width, height = -(-camera.width // step), -(-camera.height // step)
+    cx, cy = ((at - 0.5) / step + 0.5 for at in (camera.cx, camera.cy))
+    return replace(camera, width=width, height=height, fx=camera.fx / step, fy=camera.fy / step, cx=cx, cy=cy)
 
 
 def _step(camera: Intrinsics, most: int) -> int:

@@ -162,7 +162,7 @@ def quality_plot(points: Sequence[Point], cost: str, measure: str) -> bytes | No
             dx, dy = ([point.spread.get(key, 0.0) for point in curve] for key in (cost, measure))
             joined = "-" if x in (sorted(x), sorted(x, reverse=True)) else "none"  # a line back and forth would say nothing
             line: dict[str, Any] = {"linestyle": joined, "color": colour, "marker": marker, "markersize": 5, "linewidth": 1.8, "zorder": 3}
-            bars = {"xerr": dx if any(dx) else None, "yerr": dy if any(dy) else None}
+            bars: dict[str, Any] = {"xerr": dx if any(dx) else None, "yerr": dy if any(dy) else None}
             axes.errorbar(x, y, **bars, capsize=2.5, elinewidth=1, label=METHODS[method], **line)
         if rest := [point for point in known if point.method == method and point not in curve]:
             hollow: dict[str, Any] = {"facecolors": "none", "edgecolors": colour, "linewidths": 1.2, "zorder": 4}

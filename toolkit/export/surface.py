@@ -176,9 +176,10 @@ def field_volume(
     shown: list[Array] = []
     for index, (camera, pose) in enumerate(zip(cameras, poses, strict=True)):
         progress.check()
-        frame, *rest = _rendered_frame(render, camera, pose, None if refinement.polish is None else refinement.polish[index])
-        for kept, one in zip((frames, opaque, shown), (frame, *rest), strict=True):
-            kept.append(one)
+        frame, solid, visible = _rendered_frame(render, camera, pose, None if refinement.polish is None else refinement.polish[index])
+        frames.append(frame)
+        opaque.append(solid)
+        shown.append(visible)
         progress.update(index + 1, (1 + AFTERWARDS) * len(poses), "views made for the surface")
     if refinement.settle is not None:
         depths = refinement.settle([frame.depth for frame in frames], opaque, shown)
@@ -225,7 +226,8 @@ def _rendered_frame(
     camera, size = intrinsics.pinhole(), (intrinsics.width, intrinsics.height)
     small = camera.scaled(depth.shape[1], depth.shape[0])
     if small != camera:
-        depth, opacity = enlarged(depth, *size), cv2.resize(opacity, size, interpolation=cv2.INTER_LINEAR)
+        depth = enlarged(depth, *size)
+        opacity = np.asarray(cv2.resize(opacity, size, interpolation=cv2.INTER_LINEAR), dtype=np.float32)
     depth, shown = (depth, np.ones(depth.shape, bool)) if polish is None else polish(depth)
     opaque = np.where(np.isfinite(depth) & (opacity >= OPAQUE), depth, 0).astype(np.float32)
     frame = DepthFrame(reliable_depth(depth, opacity, camera.fx), as_bytes(np.asarray(rendered.rgb)), camera, small, pose)

@@ -129,7 +129,7 @@ def draw_sample(scene: TrainingScene, rng: np.random.Generator, wanted: PictureS
     near, middle, far = depth_range(pictures.depths[own.unique()], scene.depth_hint, scene.name)
     key = int(own[0, 0])
     ahead = poses[key, :3, 3] + middle * poses[key, :3, 2]
-    share, closed = float(rng.uniform(*volume.region)), bool(rng.random() < volume.closed)
+    share, closed = float(rng.uniform(volume.region[0], volume.region[1])), bool(rng.random() < volume.closed)
     space = region_around(surface_points(pictures, own.unique()), (ahead, 0.6 * middle), share, closed)
     low, high = volume.voxels_to_median
     voxel = middle / math.exp(rng.uniform(math.log(low), math.log(high)))
