@@ -23,7 +23,7 @@ def export(
 ) -> None:
     """Write the field as files for other programs, in the input's own frame and scale, into DIR/exports.
 
-    --formats is for this time: what else the run was asked for is not forgotten, and files that are there of the same field stay.
+    --formats is for this call only: the formats of the run stay as they are set, and existing files of the same field stay.
     """
     wanted = None if formats is None else [name.strip() for name in formats.split(",") if name.strip()]
     if wanted == []:

@@ -38,7 +38,7 @@ MOST_TRIANGLES = 2_000_000
 MOST_SPARSE = 20_000  # points that go with exported cameras
 VIDEO_SIDE = 640
 FPS = 30
-REMOVED = "of an earlier field, and removed: {}; `fieldfuse export {} --formats …` makes of this one what the run is not asked for"
+REMOVED = "of an earlier field, and removed: {}; `fieldfuse export {} --formats …` exports this one"
 GONE = (
     "the folder of the capture, {}, is not there any more, and its pictures are needed; put it back (or repeat the run's own command with "
     "its new place) and run the command again"

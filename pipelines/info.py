@@ -183,7 +183,7 @@ def effects_facts(target: Path, quiet: bool) -> dict[str, Any]:
     """What an earlier run found, or what its pictures and given poses show now.
 
     Raises:
-        InputError: a source without poses: shared points cannot be told from wrong matches without them.
+        InputError: a source without poses: without them shared points cannot be distinguished from wrong matches.
     """
     from fieldfuse.capture import open_capture
     from fieldfuse.effects.depth_camera import DEPTH_OFFSET, look_for_offset

@@ -192,7 +192,7 @@ class TotalBudget:
             "reused": any(job.stages.cached.values()),
         }
 
-    def note(self, told: dict[str, Any]) -> str:
+    def note(self, report: dict[str, Any]) -> str:
         """One sentence for the page."""
         chosen = self.choice
         parts = [f"pictures of {chosen.image_size} pixels", f"{chosen.fit_seconds:g} s of fitting", f"at most {chosen.resolution}³ voxels"]
@@ -204,34 +204,34 @@ class TotalBudget:
         extras = (("textures", chosen.texture), ("page to walk through", chosen.page))
         parts += [f"no {name}" for name, wanted in extras if wanted is False]
         return (
-            f"Of the {told['asked_seconds']:g} s asked for, {told['predicted_seconds']:.0f} s were predicted and"
-            f" {told['real_seconds']:.0f} s spent until this page was written; chosen: {', '.join(parts)}."
-            + (BESIDES.format(told["self_test_seconds"]) if told.get("self_test_seconds") else "")
-            + (TOO_FEW.format(told["predicted_seconds"]) if told["predicted_seconds"] > (1 + model.AGREES) * self.target else "")
+            f"Of the total budget of {report['asked_seconds']:g} s, {report['predicted_seconds']:.0f} s were predicted and"
+            f" {report['real_seconds']:.0f} s spent until this page was written; chosen: {', '.join(parts)}."
+            + (BESIDES.format(report["self_test_seconds"]) if report.get("self_test_seconds") else "")
+            + (TOO_FEW.format(report["predicted_seconds"]) if report["predicted_seconds"] > (1 + model.AGREES) * self.target else "")
         )
 
     def finish(self, job: Job, report_seconds: float) -> dict[str, Any]:
         """After the report: correct its total, and learn from stages that took other than predicted."""
-        told = self.report(job)
-        told["stages"]["report"] = {"predicted": _round(self.predicted.get("report")), "real": _round(report_seconds)}
-        if not told["reused"]:
+        report = self.report(job)
+        report["stages"]["report"] = {"predicted": _round(self.predicted.get("report")), "real": _round(report_seconds)}
+        if not report["reused"]:
             for name in NOT_FITTED:
-                real, predicted = told["stages"].get(name, {}).get("real"), self.predicted.get(name)
+                real, predicted = report["stages"].get(name, {}).get("real"), self.predicted.get(name)
                 if real and predicted and max(real, predicted) > WORTH_LEARNING and name not in ("export", "effects"):
                     self.speed.learn(name, predicted, real)
-            fitted = told["stages"].get("fit", {}).get("real")
+            fitted = report["stages"].get("fit", {}).get("real")
             if fitted and self.choice.fit_seconds:
                 beside = self.speed.seconds("beside", 1.0)
                 self.speed.learn("beside", beside, max(fitted - self.choice.fit_seconds, 0.2 * beside))
-            self._learn_effects(job, told["stages"].get("effects", {}).get("real"))
-            made = told["stages"].get("export", {}).get("real")
+            self._learn_effects(job, report["stages"].get("effects", {}).get("real"))
+            made = report["stages"].get("export", {}).get("real")
             if made and self.export_planned > WORTH_LEARNING:
                 self.speed.learn("export", self.export_planned, made)
-            if abs(told["real_seconds"] - self.target) > 2 * model.AGREES * self.target:
+            if abs(report["real_seconds"] - self.target) > 2 * model.AGREES * self.target:
                 model.remember(self.name, None)  # so far off that the machine must have changed: measured again next time
             else:
                 model.remember(self.name, self.speed)
-        return told
+        return report
 
     def _for_exports(self, job: Job, left: float) -> float:
         """Seconds that are set aside for exports: a share of what is left, no more than all of them can take, no less

@@ -210,7 +210,7 @@ def test_a_python_without_venv_is_told(tmp_path: Path) -> None:
 
 
 def test_what_is_imported_is_installed_without_the_tests() -> None:
-    """Every package that toolkit or pipelines import is asked for by setup.cfg, also without what only tests need: else what passes here
+    """Every package that toolkit or pipelines import is required by setup.cfg, also without what only tests need: else what passes here
     fails on a user's machine."""
     parsed = setup()
     extras = parsed["options.extras_require"]

@@ -369,7 +369,7 @@ class EffectsSettings:
 
 @dataclass
 class Settings:
-    """Everything that a run can be told. `budget`, `image_size` and friends of the command line land here too."""
+    """All settings of a run. `budget`, `image_size` and friends of the command line land here too."""
 
     preset: Annotated[str, one_of(*PRESETS)] = "balanced"
     engine: Annotated[str, one_of(*ENGINES)] = "auto"  # auto (numba on the CPU, triton on CUDA) | numba | triton | torch

@@ -183,7 +183,7 @@ def keep_only(rows: NDArray[Any], used: NDArray[np.bool_]) -> int:
         used: (N,) bool.
 
     Returns:
-        bytes that were given back; 0 where the system knows no such call.
+        bytes that were given back; 0 where the system has no such call.
     """
     if len(rows) != len(used) or not rows.flags.c_contiguous:
         raise ValueError("rows that are given back must be contiguous, and one mark belongs to each")
@@ -216,7 +216,7 @@ madvise = _system_call()
 
 
 def _idle_files(used: Path, name: str) -> int:
-    """Bytes of files that a control group holds and the system takes back when memory is asked for; 0 where it does not say."""
+    """Bytes of files that a control group holds and the system takes back when memory is needed; 0 where it does not report them."""
     with suppress(OSError, ValueError):
         entries = dict(line.split(" ", 1) for line in (used.parent / "memory.stat").read_text(encoding="ascii").splitlines())
         return int(entries.get(name, 0))

@@ -173,7 +173,7 @@ def test_a_stop_is_honoured_between_key_frames() -> None:
 
 
 def test_where_a_device_works_behind_the_processor_pictures_are_encoded_ahead(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Those of some key frames at once, before they are asked for, each once, and with the same result."""
+    """Those of some key frames at once, before they are needed, each once, and with the same result."""
     model, (views, keys), lattice = opinionated(), captured(11), Lattice(SPACE, 8)
     encode, together = model.encode, list[int]()
 

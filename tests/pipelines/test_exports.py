@@ -1,4 +1,4 @@
-"""What `fieldfuse export` adds, what a run is asked for from then on, and what becomes of it when the capture is gone."""
+"""What `fieldfuse export` adds, what a run writes from then on, and what becomes of it when the capture is gone."""
 
 from __future__ import annotations
 
@@ -54,7 +54,7 @@ def test_formats_of_one_command_are_not_those_of_the_run(out: Path, capsys: Caps
     assert answer.code == 0 and not stages(json.loads(answer.out))["export"], answer.err
     assert files(out) == asked | {"mesh.ply"} and (out / "mesh.ply").is_file()
     assert read_json(out / "run.json")["settings"]["export"]["formats"] == ["points", "cameras"]
-    # What the run was asked for is there all the time, and is reused.
+    # What the run's settings name is there all the time, and is reused.
     assert stages(json.loads(call(capsys, "export", out, *AGAIN).out))["export"]
     again = json.loads(call(capsys, "run", out.parent / "room", "--out", out, *FEW, *WISH).out)
     assert all(stages(again).values()), stages(again)

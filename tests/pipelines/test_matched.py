@@ -25,7 +25,7 @@ SHORT = ["--set", "init=classical", "--set", "fit.budget=1", "--set", "field.res
 
 
 def make_corner(folder: Path, count: int = 9, depth: bool = False) -> None:
-    """The textured corner as transforms.json with pictures, with its depth in millimetres when asked for."""
+    """The textured corner as transforms.json with pictures, with its depth in millimetres if wanted."""
     frames: list[dict[str, Any]] = []
     for index, pose in enumerate(arc(count, 44.0)):
         picture, metres = render(pose, CAMERA)

@@ -98,7 +98,7 @@ def test_a_changed_budget_redoes_the_field_and_what_follows(out: Path, capsys: C
 
 
 def test_a_surface_made_later_leaves_the_field_as_it_is(out: Path, capsys: Capsys) -> None:
-    """`tsdf` matches pictures, which a fit would have known had it been asked for before; nobody asks for another fit."""
+    """`tsdf` matches pictures, which a fit would have used had they been matched before; no other fit is made."""
     first = report(out)
     field = (out / "field.safetensors").read_bytes()
     answer = call(capsys, "tsdf", out, "--threads", 1, "--quiet", "--json")

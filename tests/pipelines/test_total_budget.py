@@ -49,8 +49,8 @@ def test_a_run_that_takes_what_was_asked_for(tmp_path: Path, capsys: Capsys, mon
     assert data["settings"]["fit"]["budget"] == choice["fit_seconds"]
     assert (out / "exports" / "orbit.mp4").exists() == bool(choice["video_frames"])
     assert told["self_test_seconds"] > 1 and told["real_seconds"] + told["self_test_seconds"] < whole + 0.5  # it comes on top
-    assert any("Of the 10 s asked for" in note and "this machine was measured" in note for note in data["notes"])
-    assert "Of the 10 s asked for" in (out / "report.html").read_text(encoding="utf-8")
+    assert any("Of the total budget of 10 s" in note and "this machine was measured" in note for note in data["notes"])
+    assert "Of the total budget of 10 s" in (out / "report.html").read_text(encoding="utf-8")
     assert (tmp_path / "cache" / "fieldfuse" / "speed.json").is_file() and read_json(out / "report.json")["budget"] == told
 
     again = json.loads(call(capsys, *command, "--set", "export.formats=[ply,video,cameras]").out)
@@ -124,7 +124,7 @@ def test_textures_and_the_page_are_left_out_where_they_would_take_the_fits_share
     settings, plan = fitted(200, spent=140)  # less than its share, and enough
     assert settings.export.formats == list(EXPORTS) and 30 <= plan.choice.fit_seconds < 0.35 * 200
     settings, plan = fitted(50, ["texture", "glb"], spent=25)
-    assert settings.export.formats == ["texture", "glb"]  # what was asked for by name stays
+    assert settings.export.formats == ["texture", "glb"]  # what was named stays
 
 
 def test_what_is_left_out_is_known_early_only_where_it_must_be() -> None:

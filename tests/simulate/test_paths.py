@@ -1,4 +1,4 @@
-"""Camera paths: rigid, upright, at the speed and with the shake that were asked for, clear of what stands in the scene."""
+"""Camera paths: rigid, upright, at the speed and with the shake that were set, clear of what stands in the scene."""
 
 from __future__ import annotations
 

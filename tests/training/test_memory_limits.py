@@ -69,7 +69,7 @@ def held_and_foreseen(decoder: str, threads: int) -> tuple[float, int, int]:
 
 
 def test_a_fit_climbs_where_there_is_little_memory_but_enough(monkeypatch: pytest.MonkeyPatch) -> None:
-    """What is sized for the worst case and never written is not asked for."""
+    """What is sized for the worst case and never written is not reserved."""
     settings = wanted("engine=numba", "budget=3", "field.resolution=64", "threads=1")
     monkeypatch.setattr(Schedule, "worth", lambda self, voxels, rays_left: True)
     reached = []

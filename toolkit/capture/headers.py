@@ -202,12 +202,12 @@ def read_tiff(data: bytes) -> Header | None:
             3 in values(SAMPLE_FORMAT),
             any(kind in (1, 2) for kind in values(EXTRA)),
         )
-    except Exception:  # Pillow decodes values when they are asked for, and raises many families on damaged ones
+    except Exception:  # Pillow decodes values on access, and raises many families on damaged ones
         return None
 
 
 def unturned(data: bytes) -> bytes:
-    """The file with its orientation removed if it is a TIFF: Pillow and OpenCV turn these, whatever they are asked for."""
+    """The file with its orientation removed if it is a TIFF: Pillow and OpenCV turn these, whatever the flags."""
     header = read_tiff(data)
     found = _directory(data)
     if header is None or found is None or header.orientation == 1:

@@ -268,7 +268,7 @@ def _first_decision(finding: Finding, wished: str, capture: Capture, found: Diag
     if name in OF_FIELD:
         return Decision(finding, wished, wished == "on" or (wished == "auto" and finding.there), OF_FIELD[name])
     if name == ROWS:
-        return Decision(finding, wished, False, "only told, not corrected")
+        return Decision(finding, wished, False, "only reported, not corrected")
     cameras = {frame.intrinsics for frame in capture.frames}
     if found.explained is None:
         obstacle = "cannot be worked out: too few points are shared between pictures"

@@ -133,13 +133,13 @@ def failure(facts: dict[str, Any]) -> str | None:
         or model["attempt"] == GLOBAL
         or way(facts) > PRETENDED * seen.residual
     ):
-        return f"the camera only turned on the spot (rotations explain all matches), so depth cannot be told; {SIDEWAYS}"
+        return f"the camera only turned on the spot (rotations explain all matches), so depth cannot be estimated; {SIDEWAYS}"
     if narrow and model is not None:
         return f"there is too little parallax: rays meet at {model['angle']:.2g}° on the median; {SIDEWAYS}"
     # Where homographies explain the pairs, looser rules nearly always find something, whatever the camera did.
     loose = model is not None and model["attempt"] in (LOOSE, GLOBAL)
     if loose and turned_only(facts, FLAT_SHARE_LOOSE):
-        return f"the camera turned on the spot for the most part (rotations explain most matches), so depth cannot be told; {SIDEWAYS}"
+        return f"the camera turned on the spot for the most part (rotations explain most matches), so depth cannot be estimated; {SIDEWAYS}"
     if found >= TOO_FEW and not (loose and found < count / 2 and seen.flat_share >= FLAT_SHARE):
         return None
     if seen.flat_share >= FLAT_SHARE:

@@ -36,7 +36,7 @@ AGREES = np.radians(30.0)  # matches farther apart stay within this: what a long
 CHAINED = 5  # frames apart whose turns are put one after the other before anything is mapped
 # Share of the pairs far apart that contradict these: with a fold 0.84 to 0.99 with guessed lenses and 0.58 to 0.97 with calibrated ones,
 # without up to 0.95 and 0.31 (docs/measured/performance.md).
-SUSPECT, TOLD = 0.8, 0.5
+SUSPECT, FOLDED = 0.8, 0.5
 BORNE_OUT = 0.5  # … and that contradict the model of near neighbours, too
 MEETINGS = 4  # pairs far apart that are matched for each image, where cameras meet in the near model
 WIDEST = 25.0  # degrees of parallax between two such cameras
@@ -78,7 +78,7 @@ def never_folded(job: Job, report: Report) -> Mapped | None:
     if contradicted(seen, chained(seen, count)) < SUSPECT:
         return None
     seen = turns(job, _calibrated(job, seen))
-    if contradicted(seen, chained(seen, count)) < TOLD:
+    if contradicted(seen, chained(seen, count)) < FOLDED:
         return None
     for reach in NEAR:
         near = _by_neighbours(job, seen, reach, alone)

@@ -148,7 +148,7 @@ def given_poses(capture: Capture) -> PoseResult:
     spread = float(np.linalg.norm(centres - centres.mean(axis=0), axis=1).max())
     if not spread > 1e-9 * max(1.0, float(np.abs(centres).max())):
         raise PoseError(
-            f"{capture.root}: all {len(posed)} given cameras stand on one spot, so depth cannot be told; record while "
+            f"{capture.root}: all {len(posed)} given cameras stand on one spot, so depth cannot be estimated; record while "
             f"moving sideways, or correct the poses"
         )
     without = f"{len(missing)} of {len(capture.frames)} frames come without a pose and are left out: {listed(missing)}"

@@ -87,9 +87,9 @@ def recoloured(
             see-through, up to `BESIDE` pixels from what they show: what bulges over a silhouette shows best what is behind it.
         depth: at which a voxel's size in pixels decides how densely rays are taken, working units.
         engine: auto | numba | torch. The compiled one runs on the CPU, with the deferred decoder alone.
-        relaxation: ω. With 1 every corner gets what its rays ask for in the mean, which is too little where neighbours are asked for the
-            opposite. Below 2, passes one after the other do not diverge where the way from logits to colours is straight (as in SIRT).
-        in_place: the colours of `field` itself change, once all rays were asked: no second copy of its features is made.
+        relaxation: ω. With 1 every corner moves by the mean of its rays' corrections, which is too little where neighbours move the
+            other way. Below 2, passes one after the other do not diverge where the way from logits to colours is straight (as in SIRT).
+        in_place: the colours of `field` itself change, once all rays were rendered: no second copy of its features is made.
 
     Raises:
         Interrupted: the user asked to stop; then nothing has changed.

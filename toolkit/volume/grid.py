@@ -264,7 +264,7 @@ def _aligned(buffer: Tensor, rows: int) -> Tensor:
     """(R, C) rows of Open3D's → (rows + 1, C) of the same memory from its first cache line on, and the zero row.
 
     Open3D's memory begins 16 bytes after such a line, so each row of 16 features would lie in two of them, which costs a step of a fit 6 to
-    10%. Open3D is asked for blocks here and looks at no values, so it does not matter that its own rows begin elsewhere.
+    10%. Open3D looks up blocks here and looks at no values, so it does not matter that its own rows begin elsewhere.
     """
     buffer[rows : rows + LINE] = 0  # what rows reach of the spare block
     skip = -buffer.data_ptr() % LINE // buffer.element_size()

@@ -47,7 +47,7 @@ def contract(x, y, z, shell, HAS_SHELL: tl.constexpr):
 
 @triton.jit
 def bricks_away(skip, x, y, z, extent, per_brick, width):
-    """Distance in bricks from a contracted place to the nearest brick that holds something, at most what the table knows."""
+    """Distance in bricks from a contracted place to the nearest brick that holds something, at most what the table holds."""
     i = tl.minimum(tl.maximum(tl.floor((x + extent) * per_brick).to(tl.int32) + 1, 0), width - 1)
     j = tl.minimum(tl.maximum(tl.floor((y + extent) * per_brick).to(tl.int32) + 1, 0), width - 1)
     k = tl.minimum(tl.maximum(tl.floor((z + extent) * per_brick).to(tl.int32) + 1, 0), width - 1)

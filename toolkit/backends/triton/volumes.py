@@ -125,7 +125,7 @@ def surface_cells(topology: Topology, rows: Tensor, count: Tensor, seen: Tensor,
 
     Args:
         rows, count: (M · 512 + 1, C) and (M · 512,) of the volume.
-        seen: (M · 512,) bool, corners that the local volume knows.
+        seen: (M · 512,) bool, known corners of the local volume.
         head: a `FieldHead`.
         least: logarithm of the optical thickness from which on a voxel is not see-through.
 

@@ -18,7 +18,7 @@ from fieldfuse.volume.topology import VOXELS, Topology
 
 COLOUR_SCALE = 4.0  # a latent colour of ±1 is a colour logit of ±4
 MOST = 0.93  # known terms are clamped to ± this, so that tanh is not driven to its ends
-TRUNCATION = 2.0  # voxels about the surface within which distances are told apart
+TRUNCATION = 2.0  # voxels about the surface within which distances are distinguished
 HIDDEN = 0.02  # voxels that are visible with less likelihood are not known
 BLIND = 0.1  # weight of a local volume where no depth stands out
 FREE = 0.9  # signed distances beyond which a voxel is free space for sure

@@ -140,7 +140,7 @@ def depth_likelihood(traced: Traced, distance: Tensor, voxel_size: float = 0.0) 
 
     Args:
         distance: (R,) true distances, 0 = unknown.
-        voxel_size: what is nearer than half of it cannot be told apart.
+        voxel_size: what is nearer than half of it cannot be distinguished.
 
     Returns:
         (R,) natural logarithm of Σ_i w_i exp(−½ ((t_i − t*) / s)²) with s = max(`WIDTH` · t*, voxel_size / 2), not below log `FLOOR`;
