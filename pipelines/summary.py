@@ -18,7 +18,7 @@ from fieldfuse.config import settings_dict
 from fieldfuse.effects.correct import apart
 from fieldfuse.evaluation.failure import failures
 from fieldfuse.evaluation.pictures import method_pictures, moving_pictures
-from fieldfuse.evaluation.report import report_data, write_report
+from fieldfuse.evaluation.report import report_data
 from fieldfuse.files import write_json
 from fieldfuse.pipelines.exports import put_cameras
 from fieldfuse.pipelines.fields import Fitted
@@ -177,6 +177,8 @@ def put_report(job: Job, ready: Prepared, results: Results, seconds: float) -> d
     shown = {name: [*found.pictures] for name, found in results.pictures.items()}
     unit = "m" if scene.metric else "units"
     tiles = replace(method_pictures(views, np.flatnonzero(views.test), shown, unit), moving=moving_pictures(views, left_out))
+    from fieldfuse.evaluation.report_page import write_report  # the template engine and the plots are needed only here
+
     write_report(job.folder.path, data, tiles)
     if plan is not None:
         data["budget"] = plan.finish(job, time.monotonic() - began)

@@ -67,7 +67,7 @@ def test_a_shifted_sheet_has_known_scores() -> None:
 
 def test_what_is_missing_costs_recall_and_what_is_too_much_costs_precision() -> None:
     truth, wanted = ball(), surface_points(ball(), 20_000)[0]
-    some = Mesh(truth.vertices, truth.triangles[: len(truth.triangles) // 2], truth.colours).compacted()
+    some = Mesh(truth.vertices, truth.triangles[: len(truth.triangles) // 2], truth.colours).cleaned()
     less = geometry_metrics(some, truth, wanted, 0.01, samples=20_000)
     assert less["precision_1"] == 1 and less["recall_1"] < 0.8
     floater = ball(0.3, (3, 0, 0))
@@ -133,7 +133,7 @@ def test_only_what_was_seen_is_asked_for() -> None:
     wanted, share = seen_surface(truth, [CAMERA], pose, 0.02, samples=5000)
     assert share == pytest.approx(0.375, abs=0.01)  # the cap's share: (1 − 1/4) / 2
     front = truth.vertices[:, 0] > 0.2
-    cap = Mesh(truth.vertices, truth.triangles[front[truth.triangles].all(axis=1)], truth.colours).compacted()
+    cap = Mesh(truth.vertices, truth.triangles[front[truth.triangles].all(axis=1)], truth.colours).cleaned()
     assert geometry_metrics(cap, truth, wanted, 0.02, samples=5000)["f_score_1"] > 0.99
     half, _ = seen_surface(truth, [CAMERA], pose, 0.02, region=(np.array([-2.0, -2, 0]), np.full(3, 2.0)), samples=5000)
     assert len(half) == pytest.approx(len(wanted) / 2, rel=0.05) and inside(half, (np.array([-2.0, -2, 0]), np.full(3, 2.0))).all()

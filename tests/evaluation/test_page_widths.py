@@ -6,7 +6,7 @@ from copy import deepcopy
 from pathlib import Path
 
 from fieldfuse.evaluation.compare_page import write_comparison
-from fieldfuse.evaluation.report import write_report
+from fieldfuse.evaluation.report_page import write_report
 from fieldfuse.evaluation.tradeoff import points_of, tradeoff_data
 from fieldfuse.evaluation.tradeoff_page import render_tradeoff
 from tests.evaluation.driven import Driven, driven, until

@@ -166,5 +166,6 @@ def environment(**more: str) -> dict[str, str]:
 
 
 def spawn(*arguments: object, **options: Any) -> subprocess.CompletedProcess[str]:
-    """Run `fieldfuse …` as a process of its own until it ends."""
-    return subprocess.run(command(*arguments), capture_output=True, text=True, env=environment(), **options)
+    """Run `fieldfuse …` as a process of its own until it ends; without bytecode, which a limit on files would cut off."""
+    without = {"PYTHONDONTWRITEBYTECODE": "1"}
+    return subprocess.run(command(*arguments), capture_output=True, text=True, env=environment() | without, **options)

@@ -235,6 +235,7 @@ def drop_rights() -> None:
 
 def main() -> int:
     place = Path(sys.argv[1])
+    sys.dont_write_bytecode = True  # else what is imported under a limit leaves cut-off bytecode to all others
     signal.signal(signal.SIGXFSZ, signal.SIG_IGN)
     result: dict[str, Any] = {}
     every = writers() | more_writers(place)

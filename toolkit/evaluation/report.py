@@ -163,28 +163,3 @@ def write_page(folder: Path, name: str, data: dict[str, Any], html: str) -> tupl
     with atomic_path(paths[1]) as temporary:
         temporary.write_text(html, encoding="utf-8")
     return paths
-
-
-def write_report(folder: Path | str, data: dict[str, Any], pictures: Pictures | None = None) -> tuple[Path, Path]:
-    """Write `report.json` and `report.html` into `folder`.
-
-    Args:
-        folder: the run's folder; exports are linked relative to it.
-        data: all parts are optional, extra keys are kept in the JSON. `version`, `command`, `source`, `created` (text), `seconds_total`;
-            `warnings`, `notes` (lists of sentences); `capture` {kind, frames, width, height}; `poses` {source, registered, total, models,
-            missing}; `scene` {metric, …}; `field` {voxel_size, blocks, voxels, bytes}; `evaluation` {field, tsdf} as `score_views` answers;
-            `baseline` as `nearest_image_scores` answers (in the JSON it is `evaluation.nearest_image`); `timeline` [{seconds, psnr}];
-            `stages` [{name, seconds, peak_memory_mb, cached}]; `exports` [{path, bytes, facts}] or paths; `settings` (nested plain data).
-        pictures: as `method_pictures` answers; None: none.
-
-    Returns:
-        the paths of the JSON and of the HTML file.
-
-    Raises:
-        InputError: a part has another form.
-        OutputError: the folder is not writable or the disk is full.
-    """
-    from fieldfuse.evaluation.report_page import render_page  # the template engine and the plots are needed only here
-
-    data = report_data(data, Path(folder))
-    return write_page(Path(folder), "report", data, render_page(data, pictures or Pictures()))

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from pathlib import Path
 from typing import Any
 from urllib.parse import quote
 
@@ -11,7 +12,7 @@ from fieldfuse.evaluation import words
 from fieldfuse.evaluation.page import data_uri, render, tile, view_values
 from fieldfuse.evaluation.pictures import Pictures, ViewPictures
 from fieldfuse.evaluation.plots import psnr_over_time, stage_bars
-from fieldfuse.evaluation.report import METHODS, score_rows
+from fieldfuse.evaluation.report import METHODS, report_data, score_rows, write_page
 
 WALK = "/field.html"  # the export that is linked at the top
 
@@ -101,3 +102,26 @@ def _fact(name: str, value: Any) -> str:
     if isinstance(value, int):
         return f"{words.whole(value)} {name}"
     return f"{name} {words.significant(value) if isinstance(value, float) else value}"
+
+
+def write_report(folder: Path | str, data: dict[str, Any], pictures: Pictures | None = None) -> tuple[Path, Path]:
+    """Write `report.json` and `report.html` into `folder`.
+
+    Args:
+        folder: the run's folder; exports are linked relative to it.
+        data: all parts are optional, extra keys are kept in the JSON. `version`, `command`, `source`, `created` (text), `seconds_total`;
+            `warnings`, `notes` (lists of sentences); `capture` {kind, frames, width, height}; `poses` {source, registered, total, models,
+            missing}; `scene` {metric, …}; `field` {voxel_size, blocks, voxels, bytes}; `evaluation` {field, tsdf} as `score_views` answers;
+            `baseline` as `nearest_image_scores` answers (in the JSON it is `evaluation.nearest_image`); `timeline` [{seconds, psnr}];
+            `stages` [{name, seconds, peak_memory_mb, cached}]; `exports` [{path, bytes, facts}] or paths; `settings` (nested plain data).
+        pictures: as `method_pictures` answers; None: none.
+
+    Returns:
+        the paths of the JSON and of the HTML file.
+
+    Raises:
+        InputError: a part has another form.
+        OutputError: the folder is not writable or the disk is full.
+    """
+    data = report_data(data, Path(folder))
+    return write_page(Path(folder), "report", data, render_page(data, pictures or Pictures()))
