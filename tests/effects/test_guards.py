@@ -157,7 +157,7 @@ def decided(
     def trials(some: Capture, aside: Array) -> Trial:
         assert len(some.frames) == TRAIN.sum() and aside.any() and some.points is not None
 
-        def trial(option: Corrections) -> Array | None:
+        def trial(option: Corrections, seed: int = 0) -> Array | None:
             asked.append(option)
             if scores is None:
                 return None

@@ -36,7 +36,7 @@ from fieldfuse.capture.video import read_video
 from fieldfuse.config import CaptureSettings, Settings
 from fieldfuse.errors import OutputError
 from fieldfuse.evaluation.compare_page import write_comparison
-from fieldfuse.evaluation.report import write_report
+from fieldfuse.evaluation.report_page import write_report
 from fieldfuse.evaluation.tradeoff_page import write_tradeoff
 from fieldfuse.export.cameras import write_cameras
 from fieldfuse.export.mesh import write_mesh

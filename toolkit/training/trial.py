@@ -46,14 +46,15 @@ class Trial:
         self._scene: Scene | None = None
         self._made: tuple[Corrections, Views] | None = None
 
-    def __call__(self, option: Corrections) -> Array | None:
+    def __call__(self, option: Corrections, seed: int = 0) -> Array | None:
         """(V,) PSNR of each validation frame after a fit with what `option` corrects; None: there is no answer.
 
         Args:
             option: corrections in which validation frames are placed and toned as if they were held out.
+            seed: added to that of the settings.
         """
         try:
-            return self._score(option.on_views(self._views(option)))
+            return self._score(option.on_views(self._views(option)), seed)
         except (InputError, PoseError):  # whatever is wrong is reported where it is used
             return None
 
@@ -67,10 +68,11 @@ class Trial:
             self._made = (option, views)
         return self._made[1]
 
-    def _score(self, views: Views) -> Array | None:
+    def _score(self, views: Views, seed: int) -> Array | None:
         assert self._scene is not None
         bounded, looks = _Bounded(self.progress), itertools.count()  # a clock that goes on with each look: `STEPS` steps on any machine
-        result = fit_field(views, self._scene, self.settings, bounded, ticks=lambda: next(looks) * BUDGET / STEPS)
+        settings = replace(self.settings, seed=self.settings.seed + seed)
+        result = fit_field(views, self._scene, settings, bounded, ticks=lambda: next(looks) * BUDGET / STEPS)
         self.progress.check()
         return None if bounded.over or not result.held_out else np.array(result.held_out)
 
