@@ -187,6 +187,21 @@ def test_what_a_trial_shows_to_be_worse_is_not(walked: Walked, monkeypatch: pyte
     assert data["decided_by"] == "trial" and data["trial"] == {"without": 20.0, "with": 18.0} and data["on"] is False
 
 
+@pytest.mark.parametrize(("later", "wanted"), [(0.8, True), (0.0, False)])
+def test_a_trial_that_does_not_decide_is_averaged_over_seeds(later: float, wanted: bool) -> None:
+    """One of four frames gets worse by chance: other seeds show whether the rest is better."""
+    spread = np.array([1.0, 1.0, 1.0, -2.0])
+
+    def score(option: Corrections, seed: int = 0) -> Array:
+        return 20.0 + (spread if seed == 0 else np.full(4, later)) if option.gain else np.full(4, 20.0)
+
+    plain, gained = Corrections(), Corrections(gain={"a": (2.0, 2.0, 2.0)})
+    least = module.WINS[EXPOSURE]
+    assert spread.mean() > least > module.better(score(plain), score(gained))
+    without, with_it = (module._averaged(score, score(option), option) for option in (plain, gained))
+    assert (module.better(without, with_it) >= least) is wanted
+
+
 def test_what_the_user_wants_is_corrected_whatever_trials_say(walked: Walked, monkeypatch: pytest.MonkeyPatch) -> None:
     found, corrections, _ = decided(walked, monkeypatch, {POSES: -2.0, EXPOSURE: -2.0}, on=["poses"])
     assert found[POSES].on and corrections.poses

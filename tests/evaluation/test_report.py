@@ -19,8 +19,7 @@ from fieldfuse import __version__
 from fieldfuse.errors import InputError, OutputError
 from fieldfuse.evaluation.pictures import Pictures, method_pictures
 from fieldfuse.evaluation.report import CAPTURE, FIELD, POINT, POSES, SCORE, SFM_NOTE, STAGE, plain, report_data
-from fieldfuse.evaluation.report_page import write_report
-from fieldfuse.evaluation.report_page import render_page
+from fieldfuse.evaluation.report_page import render_page, write_report
 from fieldfuse.evaluation.score import nearest_image_scores, score_views
 from fieldfuse.evaluation.terminal import report_text
 from tests.evaluation.browser import embedded_pictures

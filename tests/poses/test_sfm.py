@@ -257,9 +257,8 @@ def test_a_full_disk_is_said_to_be_one(pictures, tmp_path):
         "except OutputError as error:\n    print('OUTPUT', error)\n"
     )
     environment = {**os.environ, "PYTHONPATH": str(Path(__file__).resolve().parents[2])}
-    done = subprocess.run(
-        [sys.executable, "-B", "-c", script, str(capture.root.parent)], env=environment, capture_output=True, text=True, timeout=600, check=False
-    )
+    command = [sys.executable, "-B", "-c", script, str(capture.root.parent)]
+    done = subprocess.run(command, env=environment, capture_output=True, text=True, timeout=600, check=False)
     assert done.stdout.startswith("OUTPUT cannot write"), done.stdout + done.stderr
     assert done.stdout.count("\n") == 1
 

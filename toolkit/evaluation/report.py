@@ -11,7 +11,6 @@ import numpy as np
 from fieldfuse import __version__
 from fieldfuse.errors import InputError
 from fieldfuse.evaluation import words
-from fieldfuse.evaluation.pictures import Pictures
 from fieldfuse.evaluation.words import SCORE
 from fieldfuse.files import atomic_path, write_json
 
