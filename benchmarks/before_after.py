@@ -178,7 +178,7 @@ def plan(parts: Sequence[str], data: Path) -> list[Row]:
     rows: dict[str, list[tuple[str, Any, int]]] = {
         "times": [("demo", part, 0) for part in TIMED],
         "direct": [(name, "", 0) for name in DIRECT],
-        "fits": [(name, budget, seed) for name in FITS for seed in (0, 1) for budget in (10, 30, 60)],
+        "fits": [(name, budget, seed) for budget in (10, 30, 60) for seed in (0, 1) for name in FITS],
         "few": [(name, count, 0) for name in FEW for count in (3, 6, 12)],
         "zoo": [(name, 20, 0) for name in zoo],
         "meshes": [(name, 20, 0) for name in ROOMS],
@@ -193,11 +193,13 @@ def before_after(
     after: Annotated[Path, typer.Option(help="Checkout of the state after.")],
     data: Annotated[Path, typer.Option(help="Folder of captures.")],
     parts: Annotated[str | None, typer.Option(help=f"Comma-separated part of {','.join(PARTS)}.", show_default=False)] = None,
+    repetitions: Annotated[int, typer.Option(min=1, help="Pairs of runs that are timed.")] = 9,
     quiet: Quiet = False,
 ) -> None:
     """Scores and seconds of two checkouts, on the same machine in one run."""
     kinds = chosen(parts, PARTS, "--parts")
-    pair = Pair(Checkout("before", before.absolute()), Checkout("after", after.absolute()), data.absolute(), out.absolute())
+    sides = Checkout("before", before.absolute()), Checkout("after", after.absolute())
+    pair = Pair(*sides, data.absolute(), out.absolute(), repetitions)
     measures: dict[str, Callable[[Row], Row]] = {"times": pair.times, "meshes": pair.meshes}
 
     def run(entry: Row) -> Row:
