@@ -1,4 +1,4 @@
-"""How long work tells how far it is and learns that the user wants it to stop. Silent unless a pipeline listens."""
+"""How work reports its progress and is asked to stop. Silent unless a pipeline listens."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Every layout is told apart, and its cameras are the true ones: by exact projection, and by reprojecting what the images show."""
+"""Every layout is detected, and its cameras are the true ones: by exact projection, and by reprojecting what the images show."""
 
 from __future__ import annotations
 
@@ -194,7 +194,7 @@ def test_a_file_that_is_no_picture_is_named(tmp_path: Path, layout: str) -> None
     assert victim.name in said
 
 
-@pytest.mark.parametrize("layout", [name for name in LAYOUTS if name not in ("blender", "stray", "sens")])  # these tell no size, or hold it
+@pytest.mark.parametrize("layout", [name for name in LAYOUTS if name not in ("blender", "stray", "sens")])  # these have no size, or hold it
 def test_a_cropped_picture_does_not_pass_as_a_resized_one(tmp_path: Path, layout: str) -> None:
     LAYOUTS[layout][1](tmp_path)
     for frame in open_capture(tmp_path).frames[:2]:  # two of five: of one, the frame is left out

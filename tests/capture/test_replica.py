@@ -1,4 +1,4 @@
-"""Replica's renderings for iMAP and NICE-SLAM: where the camera is told, which line belongs to which image, unusable files."""
+"""Replica's renderings for iMAP and NICE-SLAM: where the camera is given, which line belongs to which image, unusable files."""
 
 from __future__ import annotations
 

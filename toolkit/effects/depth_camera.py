@@ -30,7 +30,7 @@ from fieldfuse.poses.points import undistorted
 from fieldfuse.progress import SILENT, Progress
 
 DEPTH_OFFSET = "depth_offset"
-UNKNOWN = "too few points are shared between pictures and have depth to tell"
+UNKNOWN = "too few points with depth are shared between images"
 SIDE = 320  # pixels along the long side; of larger maps every n-th is taken
 SMOOTH = 0.05  # share of depth within which four pixels are of one surface
 LOOKS = 4  # from a guess of where a ray meets the surface to where it does

@@ -115,7 +115,7 @@ def diagnose_tracks(seen: Tracks, began: float | None = None, timing: Timing | N
         explained = geometry.explain(seen) if len(seen.frame) else None
     frames = len(seen.names)
     if explained is None:
-        nothing = {name: Finding(name, 0.0, 0.0, "too few points are shared between pictures to tell", False) for name in ORDER}
+        nothing = {name: Finding(name, 0.0, 0.0, "too few points are shared between images", False) for name in ORDER}
         facts = {"frames": frames, "points": seen.points, "points_seconds": timing.of(POINTS)}
         return Diagnostics(nothing, None, None, None, np.zeros(frames), time.monotonic() - began, facts, timing)
     mine = np.zeros(len(seen.frame), dtype=bool)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import math
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
 
@@ -14,6 +15,7 @@ from hypothesis import strategies as st
 from fieldfuse.camera import (
     FISHEYE,
     OPENCV,
+    PINHOLE,
     Array,
     Intrinsics,
     distort,
@@ -21,9 +23,11 @@ from fieldfuse.camera import (
     pixel_grid,
     project,
     rays,
+    resample_maps,
     undistort_maps,
     unproject,
 )
+from fieldfuse.capture.poses import checked_pose
 from fieldfuse.capture.types import Capture, Frame, Views
 from fieldfuse.errors import InputError, PoseError
 from fieldfuse.evaluation.score import nearest_training
@@ -271,3 +275,48 @@ def test_lenses(coefficients: list[float], lens: str, angle: float) -> None:
     radius = np.linspace(0, reach, 20)
     errors = lens_errors(camera, np.stack([radius * np.cos(angle), radius * np.sin(angle)], axis=1))
     assert errors["values that are not finite"] == 0 and errors["bent"] < BENT and errors["bent and unbent"] < LENS
+
+
+def test_zero_lens(within: Within) -> None:
+    """No lens written as a lens with zeros."""
+    points = np.random.default_rng(1).uniform(-2, 2, (200, 2))
+    for length in (0, 4, 5, 8, 14):
+        camera = Intrinsics(640, 480, 500.0, 500.0, 320.0, 240.0, OPENCV if length else PINHOLE, (0.0,) * length)
+        within(f"{length} zeros", absolute(distort(camera, points), points), 0.0)
+    tiny = Intrinsics(640, 480, 500.0, 500.0, 320.0, 240.0, OPENCV, (1e-300, 0.0, 0.0, 0.0))
+    within("a coefficient of 1e-300", absolute(distort(tiny, points), points), 1e-12)
+    within("no points", float(len(distort(STRONG["barrel"], np.zeros((0, 2)))) + len(undistorted(tiny, np.zeros((0, 2))))), 0.0)
+
+
+def test_sizes(within: Within) -> None:
+    """Undistorting at another size is one and the same map."""
+    for name, camera in STRONG.items():
+        target, map_x, map_y, seen = undistort_maps(camera, 160, 120)
+        pixels = pixel_grid(160, 120)
+        ideal = (pixels - [target.cx, target.cy]) / [target.fx, target.fy]
+        written = np.array([reference.lens(camera.lens, camera.distortion, float(x), float(y)) for x, y in ideal])
+        u, v = (written * [camera.fx, camera.fy] + [camera.cx, camera.cy] - 0.5).T
+        got = np.stack([map_x.ravel(), map_y.ravel()], axis=1)[seen.ravel()]
+        within(f"{name}: map, pixels", absolute(got, np.stack([u, v], axis=1)[seen.ravel()]), 1e-4)
+        same, _, whole = resample_maps(camera.pinhole(), target)
+        within(f"{name}: without its lens, whole", float((~whole).sum()) + not_finite(same), 0.0)
+
+
+def test_not_rigid(within: Within) -> None:
+    """Poses that are not rigid."""
+    good = look_at(np.array([[1.0, 2, 3]]), np.zeros(3), UP)[0]
+    bad = {"zeros": np.zeros((4, 4)), "mirrored": good @ np.diag([1.0, 1, -1, 1]), "NaN": good * np.nan, "3×3": np.eye(3), "words": [["a"]]}
+    bad["infinite place"] = good + np.pad([[np.inf]], ((0, 3), (3, 0)))
+    bad["sheared by 2%"] = good @ np.diag([1.0, 1.02, 1, 1])
+    bad["scaled ×1e-200"] = good * 1e-200
+    for name, pose in bad.items():
+        within(f"taken: {name}", refused(partial(checked_pose, pose, "here"), InputError), 0.0)
+    noisy = good.copy()
+    noisy[:3, :3] += 1e-4 * np.random.default_rng(0).normal(size=(3, 3))
+    fixed = checked_pose(noisy, "here")
+    within("slightly off: made rigid", absolute(fixed[:3, :3] @ fixed[:3, :3].T, np.eye(3)), 1e-14)
+    within(
+        "cameras with a focal length of 0, NaN or -1 taken",
+        sum(refused(partial(replace(CAMERA, fx=f).checked, "here"), InputError) for f in (0.0, np.nan, -1.0, np.inf)),
+        0.0,
+    )

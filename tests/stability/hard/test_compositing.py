@@ -5,12 +5,13 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 
+import pytest
 import torch
 from hypothesis import given
 from hypothesis import strategies as st
 from torch import Tensor
 
-from fieldfuse.render.composite import distortion, ray_sum, weights
+from fieldfuse.render.composite import distortion, exclusive_sum, ray_sum, weights
 from fieldfuse.render.field import density
 from fieldfuse.render.march import first_of_ray
 from tests.stability.hard import reference
@@ -253,3 +254,56 @@ def test_distortion(data: st.DataObject, count: int) -> None:
     errors = distortion_errors([([weight / total for weight in weights], places, lengths)])
     assert errors["values that are not finite"] == 0 and errors["negative losses"] == 0
     assert errors["gradient"] < 1e-6 and errors["loss"] < 1e-6
+
+
+def test_even_samples(within: Within) -> None:
+    """8,192 even samples of a translucent ray."""
+    hold(within, compositing_errors([[total / 8192] * 8192 for total in (0.1, 1.0, 5.0, 30.0)]), relative=1e-5)
+
+
+def test_no_length(within: Within) -> None:
+    """Intervals of no length between others."""
+    rays = [[0.0], [0.0] * 50, [0.0, 1.0, 0.0, 0.0, 2.0, 0.0], [1e6, 0.0, 0.0], [0.0, 1e-12, 0.0]]
+    thickness, _, first = flatten(rays)
+    weight = weights(thickness, first)[0]
+    stopped = float(weight[thickness == 0].abs().max())
+    hold(within, compositing_errors(rays), relative=3e-7)
+    within("light stopped by no length", stopped, 0.0)
+
+
+def test_empty_rays(within: Within) -> None:
+    """Empty rays between full ones, and no ray at all."""
+    rays = [[], [0.5, 1.0], [], [], spread(100, 1e-3, 1, 1), []]
+    hold(within, compositing_errors(rays))
+    thickness, ray, first = flatten(rays)
+    opacity = ray_sum(weights(thickness, first)[0], ray, len(rays))
+    within("opacity of empty rays", float(opacity[[0, 2, 3, 5]].abs().max()), 0.0)
+    nothing = torch.zeros(0)
+    none = torch.zeros(0, dtype=torch.int64)
+    weight, light = weights(nothing, first_of_ray(none))
+    gradient = gradient_of_sum(nothing, first_of_ray(none))
+    within("samples made of nothing", float(len(weight) + len(light) + len(gradient)), 0.0)
+
+
+def test_a_loss_too_small_for_float32_is_compared_as_it_is() -> None:
+    """A weight of 1e-38 costs 1e-77, which is 0 there; a wrong loss is noticed all the same."""
+    errors = distortion_errors([([1.1754943508222875e-38], [0.0], [1.0])])
+    assert errors["loss"] < 1e-30 and by_size(torch.tensor([0.5]), [1e-77]) == 0.5
+
+
+def test_a_loss_below_the_digits_of_its_sums_is_told_to_these() -> None:
+    """A weight of 4e-16 before one of 1: the loss is 8e-16, of sums whose last digit is 2e-16."""
+    assert distortion_errors([([4e-16, 1.0], [0.0, 1.0], [0.0, 0.0])])["loss"] < 1e-6
+
+
+def test_weights_from_one_minus_exp_are_noticed(monkeypatch: pytest.MonkeyPatch) -> None:
+    def careless(thickness: torch.Tensor, first: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
+        light = torch.exp(-exclusive_sum(thickness, first)).to(thickness.dtype)
+        return light * (1 - torch.exp(-thickness)), light
+
+    monkeypatch.setitem(globals(), "weights", careless)
+    within = Within()
+    test_haze(within)
+    assert "weight, relative" in within.missed
+    test_neighbours_in_a_list(within := Within())
+    assert within.missed

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
 
@@ -10,7 +11,10 @@ import numpy as np
 import pytest
 
 from fieldfuse.camera import Array, Intrinsics
-from fieldfuse.errors import FieldfuseError, InputError
+from fieldfuse.errors import FieldfuseError, InputError, PoseError
+from fieldfuse.poses.result import given_poses
+from fieldfuse.poses.scene import describe_scene
+from fieldfuse.render.paths import look_at
 from fieldfuse.tsdf.volume import DepthFrame, TsdfVolume
 from tests.stability.hard.captures import flat, no_opacity, one_pixel, poses, prepared, saturated, texture, write_capture
 from tests.stability.hard.errors import absolute, not_finite, refused
@@ -173,3 +177,49 @@ def test_fused_holes(within: Within) -> None:
 
 def _sorted(vertices: Array) -> Array:
     return vertices[np.lexsort(vertices.round(9).T)]
+
+
+def test_constant(within: Within, tmp_path: Path) -> None:
+    """Black, white and grey pictures are refused."""
+    for value in (0, 128, 255):
+        path = write_capture(tmp_path / str(value), flat(value))
+        within(f"pictures of {value} taken", refused(partial(prepared, path), InputError, "image"), 0.0)
+
+
+def test_few_views(within: Within, tmp_path: Path) -> None:
+    """One training view, no training view, no test view, two frames."""
+    path = write_capture(tmp_path / "two", count=2)
+    _, views = prepared(path, holdout=2)
+    _, none = prepared(path, holdout=0)
+    one = write_capture(tmp_path / "one", count=1)
+    within("training views of two frames, holdout 2", abs(float((~views.test).sum()) - 1), 0.0)
+    within("test views with holdout 0", float(none.test.sum()), 0.0)
+    within("one picture taken", refused(lambda: prepared(one), InputError, "one image"), 0.0)
+
+
+def test_scenes(within: Within, tmp_path: Path) -> None:
+    """Scenes of pictures without texture, opacity or motion end in a sentence or in finite numbers."""
+
+    def still(index: int, height: int, width: int) -> Array:
+        return np.asarray(np.minimum(texture(0, height, width).astype(int) + 2 * index, 255), dtype=np.uint8)
+
+    def noise(index: int, height: int, width: int) -> Array:
+        return np.asarray(np.random.default_rng(index).integers(0, 255, (height, width, 3)), dtype=np.uint8)
+
+    for name, paint, depth in (
+        ("still", still, None), ("noise", noise, None), ("without opacity", no_opacity, None), ("spoilt depth", texture, spoilt)
+    ):  # fmt: skip
+        path = write_capture(tmp_path / name.replace(" ", "_"), paint, depth=depth)
+        try:
+            capture, _ = prepared(path)
+            scene = describe_scene(given_poses(capture).apply(capture))
+        except FieldfuseError as error:
+            within(f"{name}: refused without a sentence", float("\n" in str(error) or len(str(error)) < 20), 0.0)
+            continue
+        numbers = [scene.centre, scene.half_size, scene.median_depth, scene.near, scene.far, scene.working_from_input.translation]
+        within(f"{name}: not finite", not_finite(*numbers), 0.0)
+        within(f"{name}: sizes that are not positive", float((scene.half_size <= 0).sum() + (scene.near <= 0)), 0.0)
+    still_one = np.repeat(look_at(np.array([[1.0, 2, 3]]), np.zeros(3), np.array([0.0, 0, 1])), 3, axis=0)
+    capture, _ = prepared(write_capture(tmp_path / "spot", count=3))
+    frames = tuple(replace(frame, world_from_camera=pose) for frame, pose in zip(capture.frames, still_one, strict=True))
+    within("one spot taken", refused(lambda: given_poses(replace(capture, frames=frames)), PoseError), 0.0)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 
+import pytest
 import torch
 from hypothesis import given
 from hypothesis import strategies as st
@@ -135,3 +136,83 @@ def test_lookup(keys: list[tuple[int, int, int]], seed: int) -> None:
     errors = lookup_errors(topology, *random_places(topology, 60, seed), values)
     for name, error in errors.items():
         assert error <= (0 if "finite" in name else ABSENT if "absent" in name else VALUE), (name, error)
+
+
+def test_on_lattice(within: Within) -> None:
+    """Exactly on lattice points, from every voxel that touches them."""
+    topology = Topology(torch.stack(torch.meshgrid(*[torch.arange(-1, 1)] * 3, indexing="ij"), -1).view(-1, 3))
+    values = torch.cat([torch.randn(topology.zero_row), torch.zeros(1)])
+    places = lattice(topology)
+    inner = ((places > -8) & (places < 7)).all(1).nonzero().squeeze(1)
+    worst = 0.0
+    for index in range(8):
+        step = torch.tensor([index & 1, index >> 1 & 1, index >> 2])
+        below = places[inner] - step
+        local = below & 7
+        cell = topology.find(below >> 3) * VOXELS + (local[:, 2] * 8 + local[:, 1]) * 8 + local[:, 0]
+        got = gather(values, *corners(topology, cell, step.float().expand(len(cell), 3)))
+        worst = max(worst, absolute(got, values[inner]))
+    within("stored value, read from eight sides", worst, 0.0)
+
+
+def test_continuity(within: Within) -> None:
+    """Continuity where two voxels meet."""
+    topology = Topology(torch.stack(torch.meshgrid(*[torch.arange(-1, 1)] * 3, indexing="ij"), -1).view(-1, 3))
+    values = torch.cat([torch.randn(topology.zero_row), torch.zeros(1)])
+    places = lattice(topology)
+    worst, slope = 0.0, 0.0
+    for axis in range(3):
+        here = (places[:, axis] < 6).nonzero().squeeze(1)
+        following = places[here].clone()
+        following[:, axis] += 1
+        local = following & 7
+        there = topology.find(following >> 3) * VOXELS + (local[:, 2] * 8 + local[:, 1]) * 8 + local[:, 0]
+        inside = torch.rand(len(here), 3)
+        for back in (0.0, 1e-4):
+            first, second = inside.clone(), inside.clone()
+            first[:, axis], second[:, axis] = 1 - back, back
+            a, b = gather(values, *corners(topology, here, first)), gather(values, *corners(topology, there, second))
+            if back == 0:
+                worst = max(worst, absolute(a, b))
+            else:
+                slope = max(slope, absolute(a, b))
+    within("jump at the border", worst, VALUE)
+    within("change over 2e-4 of a voxel", slope, 2e-3)
+
+
+def test_double_gradcheck(within: Within) -> None:
+    """Gradcheck in double."""
+    topology = scattered_blocks(2, 9, 1)
+    cell, inside = random_places(topology, 6, 2)
+    rows, weights = corners(topology, cell, inside.double())
+    used, index = torch.unique(rows, return_inverse=True)
+    small = torch.randn(len(used), 2, dtype=torch.float64, requires_grad=True)
+    flat = torch.randn(len(used), dtype=torch.float64, requires_grad=True)
+    good = torch.autograd.gradcheck(lambda v: gather(v, index.int(), weights), (small,), raise_exception=False)
+    good &= torch.autograd.gradcheck(lambda v: gather(v, index, weights), (flat,), raise_exception=False)
+    within("gradcheck failures", float(not good), 0.0)
+
+
+def test_half_values(within: Within) -> None:
+    """Values in bfloat16 and float16, and under autocast."""
+    topology = scattered_blocks(8, 5)
+    cell, inside = random_places(topology, 2000, 8)
+    rows, weights = corners(topology, cell, inside)
+    for kind in (torch.bfloat16, torch.float16):
+        values = torch.cat([torch.randn(topology.zero_row), torch.zeros(1)]).to(kind)
+        exact = gather(values.double(), rows, weights.double())
+        name = str(kind).removeprefix("torch.")
+        with torch.autocast("cpu", dtype=kind):
+            mixed = gather(values.float(), rows, weights)
+            _, (share,) = scatter(rows, weights, (torch.ones(len(cell)),))
+        _, (plain,) = scatter(rows, weights, (torch.ones(len(cell)),))
+        within(f"values stored in {name}", by_size(gather(values, rows, weights), exact), 4 * float(torch.finfo(kind).eps))
+        within(f"values under {name} autocast", by_size(mixed, exact), VALUE)
+        within(f"gradients under {name} autocast", absolute(share, plain), 0.0)
+
+
+def test_a_wrong_corner_is_noticed(monkeypatch: pytest.MonkeyPatch) -> None:
+    plain = corners
+    monkeypatch.setitem(globals(), "corners", lambda *given: (plain(*given)[0].roll(1, 1), plain(*given)[1]))
+    test_linear_fields(within := Within())
+    assert within.missed

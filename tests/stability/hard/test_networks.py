@@ -11,16 +11,20 @@ from torch import Tensor
 
 from fieldfuse.nerfusion.aggregate import aggregate, evidence
 from fieldfuse.nerfusion.block_conv import block_conv3d
+from fieldfuse.nerfusion.cameras import Cameras
 from fieldfuse.nerfusion.decoder import make_decoder
 from fieldfuse.nerfusion.encoding import positional, spherical_harmonics
+from fieldfuse.nerfusion.unproject import MARGIN, project
 from fieldfuse.volume.topology import Topology
 from tests.stability.hard import reference
-from tests.stability.hard.errors import absolute, by_size, not_finite
+from tests.stability.hard.errors import absolute, by_size, not_finite, relative
 from tests.stability.hard.fields import lattice, scattered_blocks
 from tests.stability.hard.ranges import FEW, KEYS, QUICK
 from tests.stability.hard.within import Within
 
 GROUP = "networks"
+LOW = 16  # roundings of the lower precision that a gradient through a few layers may carry
+TURNS = 8  # times that, behind the sines and cosines of the paper's decoder
 
 
 def _directions() -> Tensor:
@@ -198,3 +202,97 @@ def test_aggregation_of_any_size(mean: float, spread: float, views: int, seed: i
     errors = aggregation_errors(values, visible)
     assert errors.pop("mean, by the largest value") < 1e-6 and errors.pop("variance, beyond the rounding of its inputs") <= 1
     assert not any(errors.values()), errors
+
+
+def awkward_views() -> dict[str, Tensor]:
+    """(4, 4) poses, each looking along +z at the origin unless given otherwise."""
+    ahead = torch.eye(4)
+    ahead[2, 3] = -3
+    behind = torch.eye(4)
+    behind[2, 3] = 3
+    infinity = torch.eye(4)
+    infinity[2, 3] = -1e5
+    inside = torch.eye(4)
+    beside = torch.eye(4)
+    beside[0, 3], beside[2, 3] = 1e5, -3
+    return {"ahead": ahead, "ahead again": ahead.clone(), "behind": behind, "at infinity": infinity, "inside": inside, "beside": beside}
+
+
+def test_seen_by_views(within: Within) -> None:
+    """Views at infinity, behind, inside, identical, at the border of the picture."""
+    poses = awkward_views()
+    count = len(poses)
+    cameras = Cameras.same_size(
+        torch.tensor([[FOCAL, FOCAL, WIDTH / 2, HEIGHT / 2]]).repeat(count, 1), torch.stack([*poses.values()]), WIDTH, HEIGHT
+    )
+    generator = torch.Generator().manual_seed(0)
+    points = torch.rand(400, 3, generator=generator) * 2 - 1
+    across, down = 3 * 32 / FOCAL + MARGIN * SIDE, 3 * 24 / FOCAL + MARGIN * SIDE
+    edge = torch.tensor([[across, 0, 0], [-across, 0, 0], [0, down, 0], [0, -down, 0]])  # on the border of what counts as seen from ahead
+    points = torch.cat([points, edge, edge * 1.0001, torch.zeros(1, 3)])
+    found = project(points, torch.full((len(points),), SIDE), cameras, 0.1, 10.0)
+    wrong, worst = 0, 0.0
+    for index, pose in enumerate(poses.values()):
+        local = points.double() - pose[:3, 3].double()
+        depth = local[:, 2]
+        pixels = local[:, :2] / depth[:, None] * FOCAL + torch.tensor([WIDTH / 2, HEIGHT / 2])
+        beside = MARGIN * SIDE * FOCAL / depth.clamp_min(0.1)  # cells that reach over the border count as seen
+        margin = torch.minimum(pixels, torch.tensor([WIDTH, HEIGHT]) - pixels).amin(1) + beside
+        seen = (depth > 0.1) & (depth <= 10) & (margin >= 0)
+        sure = (margin.abs() > 1e-3) & ((depth - 0.1).abs() > 1e-6)
+        wrong += int((found.visible[index] != seen)[sure].sum())
+        both = seen & found.visible[index]
+        worst = max(worst, relative(found.pixels[index][both], pixels[both], 1.0))
+    values = torch.randn(count, len(points), 4, generator=generator).requires_grad_(True)
+    mean, variance, views = aggregate(values, found.visible)
+    read = evidence(mean, variance, views, torch.full((len(points),), 3.0), torch.zeros(len(points)))
+    (mean.sum() + variance.sum()).backward()
+    assert values.grad is not None
+    within("voxels seen by the wrong views", float(wrong), 0.0)
+    within("pixels, relative", worst, 4e-6)
+    within("seen from infinity, from behind or from beside", float(found.visible[[2, 3, 5]].sum()), 0.0)
+    within("identical views that differ", absolute(found.pixels[0], found.pixels[1]), 0.0)
+    within("negative variances", float((variance < 0).sum()), 0.0)
+    within("gradients of what no view sees", float(values.grad[~found.visible].abs().sum()), 0.0)
+    within("values that are not finite", not_finite(found.pixels, found.footprint, mean, variance, read, values.grad), 0.0)
+
+
+def test_reduced_gradients(within: Within) -> None:
+    """Gradients under bfloat16 and float16 autocast against float64."""
+    directions = torch.nn.functional.normalize(torch.randn(200, 3), dim=1)
+    features = torch.randn(200, 8)
+    topology = scattered_blocks(6, 1, 1)
+    rows, weight = torch.randn(topology.zero_row, 4), torch.randn(4, 4, 3, 3, 3) * 0.1
+    pull = torch.randn(topology.zero_row, 4)
+    views, visible = torch.randn(3, 100, 4), torch.rand(3, 100) < 0.7
+    visible[0] |= ~visible.any(0)
+    for kind in (torch.bfloat16, torch.float16):
+        name, bound = str(kind).removeprefix("torch."), LOW * float(torch.finfo(kind).eps)
+        for decoder in ("deferred", "per_sample"):
+            torch.manual_seed(1)
+            net = make_decoder(decoder, 8, 32)
+            double = make_decoder(decoder, 8, 32).double()
+            double.load_state_dict({key: value.double() for key, value in net.state_dict().items()})
+            low, exact = features.clone().requires_grad_(True), features.double().requires_grad_(True)
+            with torch.autocast("cpu", dtype=kind):
+                got = net(low, directions)
+            want = double(exact, directions.double())
+            (got if decoder == "deferred" else got[1]).float().sum().backward()
+            (want if decoder == "deferred" else want[1]).sum().backward()
+            assert low.grad is not None and exact.grad is not None
+            steep = 1 if decoder == "deferred" else TURNS  # the paper's encoding multiplies what is rounded by up to 16 π
+            within(f"decoder {decoder}, {name}, by the largest", by_size(low.grad, exact.grad), steep * bound)
+        low, exact = rows.clone().requires_grad_(True), rows.double().requires_grad_(True)
+        with torch.autocast("cpu", dtype=kind):
+            block_conv3d(low, topology, weight).float().mul(pull).sum().backward()
+        block_conv3d(exact, topology, weight.double()).mul(pull.double()).sum().backward()
+        assert low.grad is not None and exact.grad is not None
+        within(f"block convolution, {name}, by the largest", by_size(low.grad, exact.grad), bound)
+        low, exact = views.clone().requires_grad_(True), views.double().requires_grad_(True)
+        with torch.autocast("cpu", dtype=kind):
+            mean, variance, _ = aggregate(low, visible)
+        (mean.float().sum() + variance.float().sum()).backward()
+        sums = aggregate(exact, visible)
+        (sums[0].sum() + sums[1].sum()).backward()
+        assert low.grad is not None and exact.grad is not None
+        within(f"aggregation, {name}, by the largest", by_size(low.grad, exact.grad), bound)

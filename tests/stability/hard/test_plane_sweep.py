@@ -228,3 +228,24 @@ def test_sweep_witnessed(within: Within) -> None:
     assert silent is not None
     changed = absolute(to_probability(costs, correction=silent).table[0], own_estimate)
     within("one that looks away: change of likelihoods", changed, 1e-6)
+
+
+def test_unsure(within: Within) -> None:
+    """Plane sweep: what tells nothing about depth is not sure of one."""
+    points = torch.tensor([[0.0, 0.0, depth] for depth in (0.6, 1.0, 2.0, 7.0)])
+    for name in (
+        "black",
+        "white",
+        "no neighbour",
+        "identical cameras",
+        "a baseline of 1e-12",
+        "one centre, turned",
+        "neighbours that look away",
+    ):
+        images, cameras = awkward()[name]
+        made = sweep_planes(list(patch_descriptors(images)), cameras, NEAR, FAR)
+        likely = -torch.diff(made.table[0], dim=0)[:, HEIGHT // 4, WIDTH // 4]  # a pixel in the middle, which neighbours see at all depths
+        even = 5 / made.table.shape[1]  # of five planes about a peak, where all are alike
+        read = made.look(points, torch.full((len(points),), TRUNCATION))
+        within(f"{name}: likeliest plane against an even share, less one", float(likely.max()) * made.table.shape[1] - 1, 1e-4)
+        within(f"{name}: sure beyond an even share", max(0.0, float(read.confidence.max()) - even), 1e-6)

@@ -6,15 +6,21 @@ from dataclasses import replace
 from pathlib import Path
 
 import torch
+from hypothesis import given
+from hypothesis import strategies as st
+from torch import Tensor
 
 from fieldfuse.errors import InputError
 from fieldfuse.render.field import Field, density
 from fieldfuse.render.rays import render_rays
 from fieldfuse.training.losses import Rates
 from fieldfuse.training.torch_engine import TorchEngine
-from fieldfuse.volume.edit import erase_empty_blocks, split
-from tests.stability.hard.errors import absolute, not_finite, refused
-from tests.stability.hard.fields import aimed_rays, small_field
+from fieldfuse.volume.edit import corner_nodes, erase_empty_blocks, resample, split, with_corner_blocks
+from fieldfuse.volume.lookup import corners, gather
+from fieldfuse.volume.topology import VOXELS, Topology
+from tests.stability.hard.errors import absolute, by_size, not_finite, refused
+from tests.stability.hard.fields import aimed_rays, lattice, scattered_blocks, small_field
+from tests.stability.hard.ranges import FEW
 from tests.stability.hard.within import Within
 
 GROUP = "prune and split"
@@ -109,3 +115,71 @@ def test_optimiser_state(within: Within) -> None:
     within("rows' moments left at a split", fresh, 0.0)
     within("decoder's moments lost", float(forgotten), 0.0)
     within("values that are not finite", not_finite(*after, grown.density_rows, grown.feature_rows, *decoder), 0.0)
+
+
+def sparse_volume(seed: int, blocks: int = 6, share: float = 0.1) -> tuple[Topology, Tensor, Tensor]:
+    """Blocks with `share` of their voxels occupied, corners included, and (M · 512 + 1, 2) values at corners."""
+    generator = torch.Generator().manual_seed(seed)
+    topology = scattered_blocks(blocks, seed)
+    topology, occupied = with_corner_blocks(topology, torch.rand(topology.zero_row, generator=generator) < share)
+    values = torch.randn(topology.zero_row + 1, 2, generator=generator)
+    values[:-1][~corner_nodes(topology, occupied)] = 0
+    values[-1] = 0
+    return topology, occupied, values
+
+
+def read(topology: Topology, occupied: Tensor, values: Tensor, place: Tensor) -> tuple[Tensor, Tensor]:
+    """Values at (N, 3) lattice places (float64) and whether an occupied voxel holds them."""
+    cell = place.floor().long()
+    local = cell & 7
+    slot = topology.find(cell >> 3)
+    row = slot.clamp_min(0) * VOXELS + (local[:, 2] * 8 + local[:, 1]) * 8 + local[:, 0]
+    held = (slot >= 0) & occupied[row]
+    return gather(values, *corners(topology, row, (place - cell).float())), held
+
+
+def split_errors(seed: int) -> dict[str, float]:
+    """A split volume against the one before, at random places of it."""
+    topology, occupied, values = sparse_volume(seed)
+    finer, finer_occupied, (finer_values,) = split(topology, occupied, [values])
+    cells = occupied.nonzero().squeeze(1)
+    pick = cells[torch.randint(len(cells), (3000,), generator=torch.Generator().manual_seed(seed))]
+    place = lattice(topology)[pick].double() + torch.rand(3000, 3, dtype=torch.float64) * 0.998 + 0.001
+    before, _ = read(topology, occupied, values, place)
+    after, held = read(finer, finer_occupied, finer_values, 2 * place)
+    return {
+        "value in occupied voxels": by_size(after, before),
+        "occupied places lost": float((~held).sum()),
+        "voxels that are not eight times as many": abs(float(finer_occupied.sum()) - 8 * float(occupied.sum())),
+        "values that are not finite": not_finite(finer_values),
+    }
+
+
+def test_trilinear_split(within: Within) -> None:
+    """A trilinear split leaves the field as it was."""
+    errors = split_errors(3)
+    for name, error in errors.items():
+        within(name, error, 1e-6 if name.startswith("value in") else 0.0)
+
+
+def test_resampled(within: Within) -> None:
+    """Resampling to another voxel size and back to the same one."""
+    topology, occupied, values = sparse_volume(7, share=1.0)
+    (same,) = resample(topology, occupied, [values], topology.keys, 1.0)
+    nodes = corner_nodes(topology, occupied)
+    constant = torch.ones_like(values)
+    within("same voxel size", absolute(same[:-1][nodes], values[:-1][nodes]), 0.0)
+    for scale in (0.37, 0.5, 0.9, 1.7):
+        keys = torch.unique((topology.keys.double() / scale).floor().long(), dim=0)
+        (other,) = resample(topology, occupied, [constant], keys, scale)
+        away = torch.minimum((other - 1).abs(), other.abs())  # a constant stays the constant, or zero where nothing is near
+        within(f"a constant at {scale} of the voxel size", float(away.max()), 1e-6)
+        within(f"not finite at {scale}", not_finite(other), 0.0)
+
+
+@FEW
+@given(st.integers(0, 10_000))
+def test_splits(seed: int) -> None:
+    errors = split_errors(seed)
+    assert errors.pop("value in occupied voxels") < 1e-6
+    assert not any(errors.values()), errors

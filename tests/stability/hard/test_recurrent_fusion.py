@@ -10,6 +10,7 @@ from torch import Tensor
 
 from fieldfuse.nerfusion.gru import LEAST, FusionGRU, RunningMean
 from fieldfuse.nerfusion.lattice import LatentVolume, Lattice, LocalVolume
+from fieldfuse.nerfusion.training.curve import saturation
 from fieldfuse.volume.space import Space
 from fieldfuse.volume.topology import Topology
 from tests.stability.hard.errors import absolute, by_size, not_finite
@@ -140,3 +141,28 @@ def test_recurrence_edges(within: Within) -> None:
     within("known by a frame that weighs nothing", absolute(unseen, (1 - drift) * held.double() + drift * value.double()), 1e-6)
     within("mean with a frame of a million", absolute(heavy[1], value), 3e-6)
     within("state beyond ±1", max(0.0, *(float(state.detach().abs().max()) - 1 for state in (*heavy, saturated))), 1e-6)
+
+
+def test_stuck_gates(within: Within) -> None:
+    """Recurrent fusion: stuck gates are reported, open ones pass a gradient.
+
+    A gate at its end passes hardly any gradient: what counts is that its share is measured and shown (`GateWatch`).
+    """
+    topology = Topology(torch.zeros((1, 3), dtype=torch.int64))
+    inside, once = torch.ones(SIZE, dtype=torch.bool), torch.ones(SIZE)
+    for name, bias, wanted in (("open", 0.0, 0.0), ("stuck", 1e3, 1.0), ("shut", -1e3, 1.0)):
+        torch.manual_seed(0)
+        gru = FusionGRU(4, 8)
+        seen: list[float] = []
+        hook = gru.update.register_forward_hook(lambda module, given, answer, seen=seen: seen.append(saturation(torch.sigmoid(answer))))
+        last = [parameter for key, parameter in gru.update.named_parameters() if key.endswith("bias")][-1]
+        last.data.fill_(bias)
+        raw = torch.randn(SIZE + 1, 4).requires_grad_(True)
+        state = fuse(gru, torch.full((SIZE + 1, 4), 0.3), once, torch.tanh(raw), raw, once, topology, inside)
+        state[:-1].sum().backward()
+        hook.remove()
+        assert raw.grad is not None
+        within(f"{name}: share of saturated gates, off by", abs(seen[0] - wanted), 0.05)
+        within(f"{name}: values that are not finite", not_finite(state, raw.grad), 0.0)
+        if name == "open":
+            within("open: no gradient", float(raw.grad.abs().sum() == 0), 0.0)

@@ -6,6 +6,7 @@ import math
 from pathlib import Path
 
 import numpy as np
+import torch
 import trimesh
 from hypothesis import given
 from hypothesis import strategies as st
@@ -16,16 +17,20 @@ from fieldfuse.camera import (
     Array,
     Intrinsics,
     Similarity,
+    invert,
+    pixel_grid,
+    rays,
     world_from_opengl,
 )
-from fieldfuse.export.cameras import write_cameras
+from fieldfuse.export.cameras import quaternion, write_cameras
 from fieldfuse.export.mesh import write_mesh
+from fieldfuse.export.ply import write_points
 from fieldfuse.files import read_json
 from fieldfuse.render.image import render_view
 from fieldfuse.render.paths import look_at
 from fieldfuse.tsdf.mesh import Mesh
 from fieldfuse.volume.space import Space
-from tests.stability.hard.errors import absolute, largest, not_finite
+from tests.stability.hard.errors import absolute, largest, not_finite, relative
 from tests.stability.hard.fields import small_field
 from tests.stability.hard.places import EARTH, SCALES, ball, rotation, similarity
 from tests.stability.hard.ranges import QUICK
@@ -175,3 +180,69 @@ def test_any_similarity(power: float, far: float, seed: int) -> None:
     points = np.random.default_rng(seed).uniform(-2, 2, (10, 3))
     errors = similarity_errors(similarity(10.0**power, 10.0**far, seed), points)
     assert max(errors.values()) <= 4, errors
+
+
+def placed_pictures(input_from_working: Similarity) -> tuple[Array, Array, Array]:
+    """Two pictures and a depth map of one field: its camera as it is, and through a camera that came from the input's frame."""
+    field = small_field(6)
+    camera = Intrinsics(40, 30, 45.0, 45.0, 20.0, 15.0)
+    pose = look_at(np.array([[2.5, -1.8, 1.6]]), np.array([0.1, -0.2, 0.3]), np.array([0.0, 0, 1]))[0]
+    again = input_from_working.inverse().poses(input_from_working.poses(pose))
+    before, after = render_view(field, camera, pose), render_view(field, camera, again)
+    return before.rgb, after.rgb, np.abs(after.depth - before.depth)
+
+
+def test_same_picture(within: Within) -> None:
+    """The same picture wherever the input lies."""
+    for seed, (scale, away) in enumerate(((1e-3, 1.0), (1e3, 1.0), (1.0, EARTH), (1e3, EARTH))):
+        before, after, _ = placed_pictures(similarity(scale, away, seed))
+        truth = np.clip(before + 0.05 * np.sin(np.arange(before.size)).reshape(before.shape), 0, 1)
+        change = abs(_psnr(after, truth) - _psnr(before, truth))
+        within(f"PSNR against one truth, ×{scale:g} and {away:g} away, dB", change, PSNR)
+
+
+def _psnr(picture: Array, truth: Array) -> float:
+    return float(-10 * np.log10(np.mean((picture.astype(np.float64) - truth) ** 2)))
+
+
+def test_ray_directions(within: Within) -> None:
+    """Rays of the working frame against float64."""
+    camera = Intrinsics(64, 48, 50.0, 55.0, 30.0, 26.0)
+    pose = look_at(np.array([[1.5, -0.3, 0.8]]), np.zeros(3), np.array([0.0, 0, 1]))[0]
+    pixels = pixel_grid(64, 48)
+    origins, directions, cosine = rays(camera, pose, pixels)
+    local = np.stack([(pixels[:, 0] - 30.0) / 50.0, (pixels[:, 1] - 26.0) / 55.0, np.ones(len(pixels))], axis=1)
+    length = np.linalg.norm(local, axis=1)
+    within("directions", absolute(directions, (local / length[:, None]) @ pose[:3, :3].T), 1e-7)
+    within("length of directions", absolute(directions.double().norm(dim=1), torch.ones(len(pixels))), 2e-7)
+    within("cosines, relative", relative(cosine, 1 / length), 1e-7)
+    within("origins", absolute(origins, np.tile(pose[:3, 3], (len(pixels), 1))), 1e-7)
+
+
+def test_points(within: Within, tmp_path: Path) -> None:
+    """Points in the input's coordinates."""
+    mesh = ball()
+    for scale, away in PLACES:
+        placed = similarity(scale, away, 4)
+        path = tmp_path / "points.ply"
+        write_points(path, mesh.vertices, mesh.colours, mesh.normals, placed.inverse())
+        read = _vertices(trimesh.load(path, process=False))
+        size = scale * float(np.ptp(mesh.vertices, axis=0).max())
+        error = absolute(read, placed.points(mesh.vertices)) / size
+        within(f"{_label(scale, away)}, by the model's size", error, RELATIVE)
+
+
+def test_quaternions(within: Within) -> None:
+    """Quaternions of half turns, tiny turns and everything between."""
+    worst = 0.0
+    for axis in ([1.0, 0, 0], [0, 1.0, 0], [0, 0, 1.0], [1.0, 1.0, 0], [1.0, -2.0, 3.0]):
+        unit = np.array(axis) / np.linalg.norm(axis)
+        cross = np.array([[0, -unit[2], unit[1]], [unit[2], 0, -unit[0]], [-unit[1], unit[0], 0]])
+        for angle in (0.0, 1e-12, 1e-8, 1e-4, 1.0, np.pi - 1e-8, np.pi, np.pi + 1e-8):
+            turn = np.eye(3) + np.sin(angle) * cross + (1 - np.cos(angle)) * cross @ cross
+            w, *rest = quaternion(turn)
+            wanted = np.array([np.cos(angle / 2), *(np.sin(angle / 2) * unit)])
+            got = np.array([w, *rest])
+            worst = max(worst, min(absolute(got, wanted), absolute(got, -wanted)))
+    within("quaternion of a rotation", worst, 1e-7)
+    within("inverse of the inverse", absolute(invert(invert(np.eye(4))), np.eye(4)), 0.0)

@@ -188,7 +188,7 @@ def _take(
         known = tl.where(new, inherited, known)
     tl.store(out + (block * 512 + voxel)[:, None] * CHANNELS + c, value, (voxel < 512)[:, None] & (c < CHANNELS))
     tl.store(out_count + block * 512 + voxel, known, voxel < 512)
-    # The zero row, by whoever comes first.
+    # The zero row, written by the first program.
     last = (voxel == 0) & (tl.program_id(0) == 0)
     nothing = tl.zeros((TILE, WIDE), tl.float32)
     tl.store(out + (blocks.to(tl.int64) * 512 + voxel)[:, None] * CHANNELS + c, nothing, last[:, None] & (c < CHANNELS))
@@ -289,7 +289,7 @@ def _refine(
     place = block.to(tl.int64) * 512 + voxel
     tl.store(out + place[:, None] * CHANNELS + c, value, (c < CHANNELS) & (voxel < 512)[:, None])
     tl.store(count + place, tl.where(touched, weight, 0.0), voxel < 512)
-    # The zero row, by whoever comes first.
+    # The zero row, written by the first program.
     last = (voxel == 0) & (tl.program_id(0) == 0)
     nothing = tl.zeros((TILE, WIDE), tl.float32)
     tl.store(out + (blocks.to(tl.int64) * 512 + voxel)[:, None] * CHANNELS + c, nothing, last[:, None] & (c < CHANNELS))

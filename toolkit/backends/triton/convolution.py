@@ -47,7 +47,7 @@ def _convolve(
     total = tl.where(kept[:, None], total, 0.0)
     out += group * COUT + o[None, :]
     tl.store(out + place[:, None] * (GROUPS * COUT), total.to(out.dtype.element_ty), (o < COUT)[None, :] & (voxel < 512)[:, None])
-    # The zero row, by whoever comes first.
+    # The zero row, written by the first program.
     last = tl.cast(blocks, tl.int64) * 512 + voxel
     nothing = tl.zeros((TILE, BOUT), out.dtype.element_ty)
     first = (tl.program_id(0) == 0) & (voxel == 0)

@@ -21,7 +21,7 @@ HIDDEN = 0.05  # relative: what lies this much behind what an image shows is not
 THRESHOLD = 1e-3  # samples of smaller weight are not decoded; they keep their gradient as obstacles
 WIDTH = 0.03  # relative: how close to the true distance a weight counts as right
 FLOOR = 1e-3  # smallest likelihood: a ray with no weight near the truth costs this much and no more
-ALIVE = 0.1  # spatial deviation of features below this means that the encoder tells places no longer apart
+ALIVE = 0.1  # spatial deviation of features below this means that the encoder no longer distinguishes places
 
 
 @dataclass(frozen=True)

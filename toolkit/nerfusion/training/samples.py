@@ -29,7 +29,7 @@ POOL = 16  # images of an object that a sample chooses among
 SHELL = 1.0  # width of the contracted shell, as fits use it
 MARGIN = 1.05
 POINTS = 4000
-FEWEST = 16  # points or depths that tell where a scene is
+FEWEST = 16  # points or depths that locate a scene
 LEAST, STEP = 32, 8  # of the resolution
 Rows = list[tuple[list[int], list[int]]]  # references and targets of each key frame
 
@@ -234,7 +234,7 @@ def depth_range(depths: Tensor, hint: float | None, where: str) -> tuple[float, 
     known = depths[depths > 0]
     if len(known) < FEWEST:
         if hint is None:
-            raise InputError(f"{where}: neither depth images nor cameras tell how deep the scene is; leave it out")
+            raise InputError(f"{where}: neither depth images nor cameras give the depth of the scene; remove it")
         return 0.5 * hint, hint, 2.0 * hint
     part = known[:: max(1, len(known) // 20000)].double()
     near, middle, far = torch.quantile(part, part.new_tensor([0.01, 0.5, 0.99])).tolist()
