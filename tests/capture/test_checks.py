@@ -17,7 +17,7 @@ from fieldfuse.capture import open_capture
 from fieldfuse.capture.checks import check_capture
 from fieldfuse.capture.depth_checks import Sample, check_depth, unit_factor
 from fieldfuse.capture.types import Capture, Frame
-from fieldfuse.errors import InputError, Interrupted
+from fieldfuse.errors import FieldfuseError, InputError, Interrupted
 from fieldfuse.progress import Progress
 from fieldfuse.simulate.paths import PathSettings, plan
 from fieldfuse.simulate.procedural import random_scene
@@ -25,6 +25,22 @@ from tests.capture.board import capture_of, save, texture
 from tests.conftest import shared_data
 
 SIZE = (120, 160)
+REAL = ["fox_540x960", "lego_400", "dtu_scan24_384", "redkitchen", "scannet_sample_11", "llff_fern_8", "redwood_livingroom1", "gum_360x640"]
+def corridor(pose: Array, seed: int) -> tuple[Array, Array]:
+    """(60, 80) depth along z and (60, 80) grey of a long corridor with doors at regular distances and posters that are not."""
+    v, u = np.mgrid[0:60, 0:80]
+    rays = np.stack([(u + 0.5 - 40) / 70, (v + 0.5 - 30) / 70, np.ones((60, 80))], axis=-1) @ pose[:3, :3].T
+    depth, grey = np.full((60, 80), 40.0), np.full((60, 80), 60.0)
+    posters = np.random.default_rng(seed).uniform(30, 220, 400)
+    for normal, distance, shade in (((1, 0, 0), 1.2, 150), ((-1, 0, 0), 1.2, 160), ((0, 1, 0), 1.4, 90), ((0, -1, 0), 1.1, 200)):
+        towards = rays @ np.array(normal, float)
+        along = (distance - pose[:3, 3] @ np.array(normal, float)) / np.maximum(towards, 1e-6)
+        nearer = (towards > 1e-6) & (along < depth)
+        place = pose[2, 3] + along * rays[..., 2]
+        door = (np.mod(place, 2.0) < 0.9) & (abs(normal[0]) == 1)
+        pattern = np.where(door, 40.0, 0.4 * shade + 0.6 * posters[np.clip(place / 0.7, 0, 399).astype(int)])
+        depth, grey = np.where(nearer, along, depth), np.where(nearer, pattern, grey)
+    return depth, grey
 
 
 def photos(folder: Path, pictures: list[Array], suffix: str = ".jpg") -> Capture:
@@ -350,3 +366,33 @@ def test_wrong_units_of_thirty_real_frames_are_named(factor: float) -> None:
     times = f"{factor:g} times smaller" if factor > 1 else f"{1 / factor:g} times larger"
     with pytest.raises(InputError, match=f"would if it were {times}".replace("+", "[+]")):
         check_depth(capture)
+
+
+@pytest.mark.parametrize("step", [0.3, 1.0, 2.0])
+@pytest.mark.parametrize("seed", [0, 1, 2])
+def test_a_corridor_filmed_in_long_steps_is_in_the_right_unit(step: float, seed: int, tmp_path: Path) -> None:
+    """Each step looks much as if the camera had stood still before something far away."""
+    rng, frames = np.random.default_rng(seed), []
+    for index in range(14):
+        pose = np.eye(4)
+        pose[:3, :3] = cv2.Rodrigues(rng.normal(0, 0.02, 3))[0]
+        pose[:3, 3] = [*rng.normal(0, 0.03, 2), step * index]
+        depth, grey = corridor(pose, seed)
+        np.save(tmp_path / f"{index}.npy", (1000 * depth * (1 + rng.normal(0, 0.005, depth.shape))).astype(np.float32))
+        image = save(tmp_path / f"{index}.png", np.repeat(grey[..., None], 3, axis=2).astype(np.uint8))
+        frames.append(Frame(f"{index:02d}", image, intrinsics=CAMERA, world_from_camera=pose, depth=tmp_path / f"{index}.npy"))
+    check_capture(capture_of(tmp_path, frames, kind="7scenes", metric=True, ordered=True))
+
+
+@pytest.mark.parametrize("name", REAL)
+def test_real_captures_pass(name: str) -> None:
+    capture = open_capture(shared_data(name))
+    assert len(check_capture(capture).frames) == len(capture.frames)
+
+
+@pytest.mark.parametrize("name", ["redkitchen", "redwood_livingroom1"])
+@pytest.mark.parametrize("factor", [1000.0, 0.001])
+def test_wrong_units_of_real_depth_are_noticed(name: str, factor: float) -> None:
+    capture = open_capture(shared_data(name))
+    with pytest.raises(FieldfuseError, match="1000 times"):
+        check_capture(replace(capture, depth_scale=capture.depth_scale * factor))

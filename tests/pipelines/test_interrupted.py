@@ -10,6 +10,8 @@ from pathlib import Path
 
 import pytest
 
+from fieldfuse.pipelines.console import STOPPING
+from fieldfuse.render.field import Field
 from tests.pipelines.made import call, environment, make_room
 from tests.pipelines.short import FAST, HUNG, report, stages, wait_for
 
@@ -54,3 +56,23 @@ def test_ctrl_c_while_code_is_made_from_text(tmp_path: Path) -> None:
     there = environment(PYTHONPATH=os.pathsep.join([str(tmp_path), str(Path(__file__).parents[2])]))
     answer = subprocess.run([sys.executable, "-m", "interrupted"], env=there, capture_output=True, text=True, timeout=HUNG)
     assert answer.returncode == 130 and answer.stderr == "fieldfuse: stopped\n" and answer.stdout == "tidied\n"
+
+
+def test_ctrl_c_twice_ends_at_once(tmp_path: Path) -> None:
+    make_room(tmp_path / "room", 10)
+    process = fitting(tmp_path / "fitting", "run", tmp_path / "room", "--out", tmp_path / "out", *FAST, *LONG)
+    wait_for(tmp_path / "fitting", process)
+    process.send_signal(signal.SIGINT)
+    assert process.stderr is not None
+    while process.stderr.readline().strip() not in (STOPPING, ""):  # the first has been heard
+        pass
+    process.send_signal(signal.SIGINT)
+    _, err = process.communicate(timeout=HUNG)
+    assert process.returncode == 130  # after one alone there would be a report, and code 0
+    assert "Traceback" not in err
+    # A fit ends within a step of the first, so its stage may be whole by the time of the second; nothing after it is.
+    done = {path.stem for path in (tmp_path / "out" / "stages").glob("*.json")}
+    assert "views" in done and done.isdisjoint({"render", "export", "evaluate"})
+    assert not (tmp_path / "out" / "report.json").exists() and not (tmp_path / "out" / "exports").exists()
+    if "field" in done:
+        assert Field.load(tmp_path / "out" / "field.safetensors").voxels > 0

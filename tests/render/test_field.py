@@ -10,7 +10,7 @@ import torch
 
 from fieldfuse.camera import Intrinsics, Similarity
 from fieldfuse.errors import InputError
-from fieldfuse.render.field import Field
+from fieldfuse.render.field import Field, density
 from fieldfuse.render.image import render_view
 from fieldfuse.render.rays import render_rays
 from tests.render.made import random_field, random_rays
@@ -78,3 +78,8 @@ def test_depth_is_along_z_of_a_wall() -> None:
     picture = render_view(field, Intrinsics(33, 33, 60, 60, 16.5, 16.5), pose)
     assert picture.opacity.min() > 0.99
     assert np.abs(picture.depth - 3.05).max() < field.voxel_size
+
+
+def test_density_stays_finite() -> None:
+    raw = torch.tensor([-1e30, -50.0, 0.0, 50.0, 1e30])
+    assert bool(torch.isfinite(density(raw)).all())

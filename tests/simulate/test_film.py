@@ -16,11 +16,12 @@ from torch.utils._python_dispatch import TorchDispatchMode
 from fieldfuse.camera import Intrinsics, project, unproject
 from fieldfuse.effects.effect_specs import PRESETS, parse, preset
 from fieldfuse.effects.models import MotionBlur, RollingShutter, decode_srgb, encode_srgb, to_bytes
-from fieldfuse.simulate.eye import take
+from fieldfuse.simulate.eye import eye_of, take
 from fieldfuse.simulate.film import Film, FilmCamera, Shot
 from fieldfuse.simulate.materials import TextureBank
 from fieldfuse.simulate.paths import PathSettings, plan
 from fieldfuse.simulate.procedural import random_scene
+from fieldfuse.simulate.scene import Scene
 from fieldfuse.tone import share, square_radius
 
 CAMERA = Intrinsics(80, 60, 60.0, 60.0, 40.0, 30.0)
@@ -215,3 +216,14 @@ def test_compression_is_what_the_file_will_hold(bank: TextureBank) -> None:
     shot, clean = filmed(bank, "compression:strong").shot(0), filmed(bank).shot(0)
     assert shot.jpeg is not None and shot.jpeg[:2] == b"\xff\xd8" and clean.jpeg is None
     assert np.abs(shot.rgb.astype(int) - clean.rgb).mean() > 1
+
+
+def test_exact_geometry_with_a_lens_and_rows(bank: TextureBank) -> None:
+    """Depth through a lens: unprojected along the lens' own rays it lies on the scene's surfaces."""
+    film = filmed(bank, "distortion", "rolling_shutter")
+    shot = film.shot(0)
+    assert isinstance(film.scene, Scene)
+    eye = eye_of(film.intrinsics, 2, torch.device("cpu"))
+    rays = (eye.directions / eye.cosine[:, None]).numpy() * shot.depth.reshape(-1, 1)
+    points = rays @ shot.world_from_camera[:3, :3].T + shot.world_from_camera[:3, 3]
+    assert np.quantile(film.scene.clearance(torch.from_numpy(points)).abs().numpy(), 0.98) < 2e-3

@@ -130,3 +130,20 @@ def test_what_is_little_finer_than_usual_is_no_level_of_its_own() -> None:
     assert worth_a_level(USUAL) == worth_a_level(USUAL + 32) == worth_a_level(FINER - 1) == USUAL
     assert worth_a_level(FINER) == FINER and worth_a_level(64) == 64
     assert np.all(np.diff([worth_a_level(resolution) for resolution in range(64, 2 * FINEST, 32)]) >= 0)
+
+
+def test_a_fit_ends_with_its_seconds_or_its_rays_whichever_are_spent_first() -> None:
+    free, bound = plan(), plan()
+    bound.most_rays = 1000
+    assert free.position(4.0, 10**9) == bound.position(4.0, 100) == 0.4
+    assert bound.position(4.0, 700) == 0.7 and bound.position(4.0, 1000) == 1
+    assert free.rays_left(4.0, 800) == pytest.approx(1200) and bound.rays_left(4.0, 800) == 200
+
+
+def test_the_papers_preset_has_none_of_the_extras() -> None:
+    settings = load_settings("paper")
+    network, fit = settings.network, settings.fit
+    assert (network.levels, network.gamma, network.agreement, network.recolour, network.depth_from) == (1, 0.6, False, False, "off")
+    assert (settings.keyframes.method, settings.field.decoder, settings.field.init) == ("uniform", "per_sample", "network")
+    assert not any((fit.distortion, fit.opacity, fit.slow_within, fit.depth, fit.soften)) and fit.depth_from == fit.moving == "off"
+    assert settings.effects.mode == "off"
