@@ -187,19 +187,25 @@ def test_what_a_trial_shows_to_be_worse_is_not(walked: Walked, monkeypatch: pyte
     assert data["decided_by"] == "trial" and data["trial"] == {"without": 20.0, "with": 18.0} and data["on"] is False
 
 
-@pytest.mark.parametrize(("later", "wanted"), [(0.8, True), (0.0, False)])
-def test_a_trial_that_does_not_decide_is_averaged_over_seeds(later: float, wanted: bool) -> None:
-    """One of four frames gets worse by chance: other seeds show whether the rest is better."""
-    spread = np.array([1.0, 1.0, 1.0, -2.0])
+@pytest.mark.parametrize(("first", "later", "wanted", "seeds"), [
+    (0.08, 0.8, True, {0, 1, 2}), (0.12, 0.0, False, {0, 1, 2}), (0.03, 0.8, False, {0}), (0.5, 0.0, True, {0})
+])  # fmt: skip
+def test_a_near_tie_is_decided_by_more_seeds(
+    first: float, later: float, wanted: bool, seeds: set[int], walked: Walked, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """What one seed decides clearly is not tried again."""
+    seen, found = walked
+    monkeypatch.setattr(module, "gather", lambda *_, **__: seen)
+    frames = [Frame(name, Path(f"{name}.png"), CAMERA, pose) for name, pose in zip(seen.names, seen.poses, strict=True)]
+    tried: set[int] = set()
 
     def score(option: Corrections, seed: int = 0) -> Array:
-        return 20.0 + (spread if seed == 0 else np.full(4, later)) if option.gain else np.full(4, 20.0)
+        tried.add(seed)
+        return np.full(4, 20.0 + (first if seed == 0 else later) * bool(option.gain))
 
-    plain, gained = Corrections(), Corrections(gain={"a": (2.0, 2.0, 2.0)})
-    least = module.WINS[EXPOSURE]
-    assert spread.mean() > least > module.better(score(plain), score(gained))
-    without, with_it = (module._averaged(score, score(option), option) for option in (plain, gained))
-    assert (module.better(without, with_it) >= least) is wanted
+    settings = EffectsSettings(off=["poses"])
+    got = decide(Capture("transforms", Path(), tuple(frames)), ~TRAIN, settings, found=found, trials=lambda some, aside: score)
+    assert tried == seeds and {one.finding.effect: one.on for one in got.decisions}[EXPOSURE] is wanted
 
 
 def test_what_the_user_wants_is_corrected_whatever_trials_say(walked: Walked, monkeypatch: pytest.MonkeyPatch) -> None:

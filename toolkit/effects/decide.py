@@ -49,7 +49,8 @@ WINS = {POSES: 0.0, LENS: 0.0, EXPOSURE: 0.1, VIGNETTING: 0.1, BLUR: 0.3}
 TRIED, VALIDATED = 56, 8  # training frames that take part in a trial, and those of them that it scores, at most
 FEWEST_TRIED = 6  # training frames without which there is no trial
 EVIDENCE, BOUND, CHECK, TRIAL = "evidence", "bound", "check", "trial"  # which guard had the last word
-SEEDS_IF_UNSURE = (1, 2)  # of the fits that are averaged with the first where one alone does not decide
+NEAR_TIE = 0.05  # decibels: so much last digits of one and the same fit move the outcome of a trial
+SEEDS_OF_TIE = (1, 2)  # of the fits that are averaged with the first in a near tie
 
 
 class Trial(Protocol):
@@ -195,7 +196,7 @@ def better(without: Array, with_it: Array) -> float:
 
 def _averaged(score: Trial, first: Array, option: Corrections) -> Array:
     """(V,) means over the first trial and those of other seeds that give an answer."""
-    again = [score(option, seed) for seed in SEEDS_IF_UNSURE]
+    again = [score(option, seed) for seed in SEEDS_OF_TIE]
     return np.mean([first, *(one for one in again if one is not None)], axis=0)
 
 
@@ -247,7 +248,7 @@ def _judged(decisions: dict[str, Decision], worked: Worked, capture: Capture, fo
                 continue
             least = max(WINS[name] for name in members)
             without, with_it = best, value
-            if (value - best).mean() >= least > better(best, value):
+            if abs(better(best, value) - least) < NEAR_TIE:
                 without = _averaged(score, best, worked.parts(frozenset(fixed), tried=True))
                 with_it = _averaged(score, value, option)
             trial = {"without": float(without.mean()), "with": float(with_it.mean())}
