@@ -52,7 +52,7 @@ def test_turning_on_the_spot_is_degrees_a_second(bank: TextureBank) -> None:
 @given(st.floats(0.5, 40), st.integers(0, 1000))
 def test_shake_has_the_angular_speed_asked_for(degrees: float, seed: int) -> None:
     shake, step = Shake(degrees, np.random.default_rng(seed)), 1e-3
-    times = np.arange(0, 600, 0.05)  # long enough that a few slow waves come to their mean
+    times = np.arange(0, 6000, 0.05)  # so long that a few slow waves come to their mean: after 600 s it is 7% off with seed 259
     before, after = (Rotation.from_rotvec(shake.vectors(at)).as_matrix() for at in (times, times + step))
     chord = np.linalg.norm(after - before, axis=(1, 2))  # 2 √2 sin(angle / 2)
     speed = np.rad2deg(2 * np.arcsin(chord / np.sqrt(8))) / step

@@ -166,7 +166,7 @@ def test_resolution_follows_the_voxel_size_within_bounds() -> None:
 
 def test_depth_range_falls_back_to_the_hint_and_refuses_without() -> None:
     assert depth_range(torch.zeros(2, 8, 8), 3.0, "x") == (1.5, 3.0, 6.0)
-    with pytest.raises(InputError, match="how deep"):
+    with pytest.raises(InputError, match="depth of the scene"):
         depth_range(torch.zeros(2, 8, 8), None, "x")
     near, middle, far = depth_range(torch.linspace(1, 3, 1000).view(1, 10, 100), None, "x")
     assert (near, middle, far) == pytest.approx((1.02, 2.0, 2.98), abs=0.01)
