@@ -186,7 +186,7 @@ def cut_images(capture: Capture, out: Path, threads: int, progress: Progress = S
     folder = Path(out) / "frames" / VIEWS
     frames = dict(zip(indices, (capture.frames[i] for i in indices), strict=True))
     names = {i: _names(frame) for i, frame in frames.items()}
-    states = {i: fingerprint(VERSION, SIDE, frame.intrinsics, exif, _state(frame)) for i, frame in frames.items()}
+    states = {i: fingerprint(VERSION, SIDE, frame.intrinsics, exif, *_state(frame)) for i, frame in frames.items()}
     done = still_good(folder, {name: states[i] for i in indices for name in names[i]})
     finished = 0
 

@@ -27,6 +27,7 @@ EVERY_STEP = (*range(1, 11), *FAR_STEPS)
 FEW_FRAMES = 60  # up to which every step of the next ten is taken: frames lie far apart there, and each match counts
 BESIDE = 2  # instants from one to the other of which views that look the same way are matched whatever they share
 MIN_COMMON_VIEWS = 3  # coarse matches between two views, of instants that go together
+EACH_VIEW = 2  # views of another instant that one is matched with at most
 LOOPS = 3  # such pairs of a frame at most
 LOOP_GAP = 20  # frames apart before a pair counts as a loop
 LOOP_ANCHORS = 60  # frames of a video that are compared with each other to find loops
@@ -65,11 +66,15 @@ def view_pairs(job: Job, sketches: list[Array]) -> Pairs:
         together = list(combinations(range(count), 2))
     else:
         together = similar_pairs(whole)
-    pairs = set()
+    pairs = set[tuple[int, int]]()
     for one, other in together:
         matched = matches_of(whole[one], whole[other])
         shared = Counter(zip(owner[one][matched[:, 0]].tolist(), owner[other][matched[:, 1]].tolist(), strict=True))
-        pairs |= {pair for pair, number in shared.items() if number >= MIN_COMMON_VIEWS}
+        best = Counter[int]()
+        for pair, number in shared.most_common():
+            if number >= MIN_COMMON_VIEWS and best[pair[0]] < EACH_VIEW:
+                pairs.add(pair)
+                best[pair[0]] += 1
         if other - one <= BESIDE and len(groups[one]) == len(groups[other]):
             pairs |= set(zip(groups[one], groups[other], strict=True))
     return sorted((min(pair), max(pair)) for pair in pairs)
