@@ -48,7 +48,8 @@ def test_one_channel_is_a_map(tmp_path: Path) -> None:
 
 
 def test_of_a_renderers_layers_the_picture_or_the_depth_is_taken(tmp_path: Path) -> None:
-    stored = planes(" ".join(f"ViewLayer.{layer}" for layer in ("Normal.R", "Normal.G", "Normal.B", "Combined.R", "Combined.G", "Combined.B")))
+    layers = ("Normal.R", "Normal.G", "Normal.B", "Combined.R", "Combined.G", "Combined.B")
+    stored = planes(" ".join(f"ViewLayer.{layer}" for layer in layers))
     stored |= {"ViewLayer.Depth.Z": planes("a b")["b"]}
     path = write_exr(tmp_path / "a.exr", stored)
     assert np.array_equal(read_exr(path)[..., 0], stored["ViewLayer.Combined.R"])
