@@ -204,8 +204,8 @@ def to_rgba(image: Array, white: float | None = None, *, linear: bool = False) -
         if alpha is not None:
             image[..., 3:] = alpha >> 8
     elif image.dtype != np.uint8:
-        most = np.float32(65535 if image.dtype == np.uint16 else 1)
-        top = np.float32(white or most)
+        most = 65535.0 if image.dtype == np.uint16 else 1.0
+        top = white or most
         finite = np.nan_to_num(image.astype(np.float32), nan=0.0, posinf=max(top, most), neginf=0.0)
         image = stored(finite / top) if linear else np.round(np.clip(finite / top, 0, 1) * 255).astype(np.uint8)
         if linear and image.ndim == 3 and image.shape[2] == 4:
