@@ -73,16 +73,17 @@ def prepare(job: Job, capture: Capture | None = None) -> Prepared:
 def find_capture(job: Job) -> Capture:
     """Detect what the source is, read it, look at every image once (at those that `choose_frames` writes, then)."""
     path = job.folder / "capture.json"
-    masks, projection = job.settings.capture.masks, job.settings.capture.projection
+    masks, light, projection = job.settings.capture.masks, job.settings.capture.light, job.settings.capture.projection
     state = source_state(job.source, job.folder.path)
-    chosen = [*([] if masks == "auto" else [masks]), *([] if projection == "auto" else [projection])]
+    given = [masks] if masks != "auto" else []
+    given += [f"{name} {value}" for name, value in (("light", light), ("projection", projection)) if value != "auto"]
     found = job.run(
         Stage(
             "capture",
             make=lambda: steps.read_capture(job.source, job.settings, job.progress),
             save=lambda capture: [_written(path, capture_to_dict(capture))],
             load=lambda: capture_from_dict(read_json(path)),
-            settings=[state, *chosen] if chosen else state,
+            settings=[state, *given] if given else state,
         )
     )
     return with_unposed(found) if job.settings.poses.source == "sfm" else found

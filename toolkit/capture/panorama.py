@@ -91,7 +91,7 @@ def _of_photos(capture: Capture, projection: str) -> Capture:
                 lost.append(frame)
     remarks = []
     if lost:
-        looked = [frame for frame in spread(lost, LOOKED_AT) if shows_sphere(upright(*read_image(frame.image)) if exif else _pixels(frame))]
+        looked = [frame for frame in spread(lost, LOOKED_AT) if shows_sphere(upright(*read_image(frame)) if exif else read_image(frame)[0])]
         if 2 * len(looked) > min(len(lost), LOOKED_AT):
             found |= {frame.name: image_header(frame.image).size for frame in lost}
             what = "image is taken for a 360° panorama" if len(lost) == 1 else "images are taken for 360° panoramas"
@@ -107,10 +107,6 @@ def _of_photos(capture: Capture, projection: str) -> Capture:
         for frame in capture.frames
     ]
     return capture.with_frames(frames, *remarks)
-
-
-def _pixels(frame: Frame) -> Array:
-    return read_image(frame.image, frame.white)[0]
 
 
 def _of_video(capture: Capture, projection: str) -> Capture:

@@ -218,7 +218,8 @@ def _names(frame: Frame) -> list[str]:
 
 def _state(frame: Frame) -> list[object]:
     """What distinguishes the files that a frame's views are made of."""
-    return [frame.image, frame.mask or "", frame.depth or "", frame.confidence or "", frame.white or 0, frame.mask_excludes]
+    shown = [frame.white, frame.linear, frame.balance]
+    return [frame.image, frame.mask or "", frame.depth or "", frame.confidence or "", shown, frame.mask_excludes]
 
 
 def _cut(frame: Frame, capture: Capture, folder: Path, done: dict[str, Path | None]) -> Iterator[Frame]:
