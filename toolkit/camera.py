@@ -168,7 +168,11 @@ def seen_at(intrinsics: Intrinsics, directions: Array) -> tuple[Array, Array]:
         pixels (..., 2), centres at +0.5, and (...) bool whether the direction lies in the image: there the lens model is one-to-one, and of
         a fisheye lens at most `WIDEST` off the axis. Pixels of other directions mean nothing.
     """
-    x, y, z = np.moveaxis(np.asarray(directions, dtype=np.float64), -1, 0)
+    with np.errstate(over="ignore", invalid="ignore"):  # coefficients may be anybody's
+        return _seen_at(intrinsics, *np.moveaxis(np.asarray(directions, dtype=np.float64), -1, 0))
+
+
+def _seen_at(intrinsics: Intrinsics, x: Array, y: Array, z: Array) -> tuple[Array, Array]:
     flat = np.hypot(x, y)
     if intrinsics.lens == EQUIRECTANGULAR:
         place, seen = np.stack([np.arctan2(x, z), np.arctan2(y, np.hypot(x, z))], axis=-1), np.ones(x.shape, dtype=bool)
@@ -216,7 +220,8 @@ def _fisheye_radius(intrinsics: Intrinsics, angle: Array) -> Array:
 def _fisheye_limit(intrinsics: Intrinsics) -> float:
     """Radians off the axis, at most `WIDEST`, up to which a fisheye lens is one-to-one."""
     angles = np.linspace(0, WIDEST, 2049)
-    folded = np.flatnonzero(~(np.diff(_fisheye_radius(intrinsics, angles)) > 0))
+    with np.errstate(over="ignore", invalid="ignore"):
+        folded = np.flatnonzero(~(np.diff(_fisheye_radius(intrinsics, angles)) > 0))
     return float(angles[folded[0]]) if len(folded) else WIDEST
 
 

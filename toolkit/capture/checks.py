@@ -219,7 +219,7 @@ def _upright_size(header: Header, exif: bool) -> tuple[int, int]:
 
 
 def _size_warnings(capture: Capture, sizes: Counter[tuple[int, int]]) -> list[str]:
-    if len(sizes) == 1:
+    if len(sizes) == 1 or all(frame.instant is not None for frame in capture.frames):
         return []
     listed = some_of([f"{width}×{height} ({number})" for (width, height), number in sizes.most_common()], 4)
     if all(frame.intrinsics is not None for frame in capture.frames):

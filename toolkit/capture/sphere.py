@@ -35,7 +35,7 @@ SIDE = 1024  # pixels of a view at most
 FIELD = 90.0  # degrees across a view
 ENOUGH = 0.95  # of the solid angle that a lens shows: what its views have to keep
 AROUND = 6  # views of a panorama along the horizon
-SAMPLES = 6000  # directions that shares are measured by
+SAMPLES = 4000  # directions that shares are measured by
 WRAP = 4  # columns of a panorama that are repeated beyond its edges, for interpolation
 # Of a fisheye lens: is there a view along the axis, how many around it, and from where these are counted (in steps, from the right)
 PATTERNS = ((True, 0, 0.0), *((False, 2, at) for at in (0.0, 0.5)), (False, 3, 0.0), (True, 2, 0.0), (False, 4, 0.5))
@@ -63,16 +63,27 @@ def views_of(camera: Intrinsics) -> tuple[tuple[View, ...], float]:
         return (made := tuple(_square(camera, turn) for turn in turns)), _kept(camera, made)
     if camera.lens != FISHEYE or share_of_pinhole(camera) >= ENOUGH:
         return (), 1.0
-    best: tuple[tuple[View, ...], float] = ((), 0.0)
+    # Each image of a capture may have a camera of its own, and they hardly differ: what is searched for is searched for once.
+    width, height = 1000, max(1, round(1000 * camera.height / camera.width))
+    alike = camera.scaled(width, height)
+    rounded = {name: round(getattr(alike, name)) for name in ("fx", "fy", "cx", "cy")}
+    turns = _turns(replace(alike, **rounded, distortion=tuple(round(value, 2) for value in camera.distortion)))
+    cropped = tuple(view for turn in turns if (view := _cropped(camera, _square(camera, turn))) is not None)
+    return cropped, _kept(camera, cropped)
+
+
+@lru_cache(maxsize=64)
+def _turns(camera: Intrinsics) -> list[Array]:
+    """(3, 3) source_from_view of as few views as keep `ENOUGH` of what a fisheye lens shows, or of those that keep most."""
+    best: tuple[list[Array], float] = ([], 0.0)
     for along, around, first in PATTERNS:
         for tilt in TILTS if around else (0.0,):
             turns = [np.eye(3)] * along + [_tilted(tilt, 360 * (k + first) / around) for k in range(around)]
-            made = tuple(_square(camera, turn) for turn in turns)
-            if (kept := _kept(camera, made)) > best[1] + 1e-9:
-                best = made, kept
+            if (kept := _kept(camera, tuple(_square(camera, turn) for turn in turns))) > best[1] + 1e-9:
+                best = turns, kept
         if best[1] >= ENOUGH:
             break
-    return tuple(cropped for view in best[0] if (cropped := _cropped(camera, view)) is not None), best[1]
+    return best[0]
 
 
 def share_of_pinhole(camera: Intrinsics) -> float:
@@ -101,7 +112,7 @@ def _square(camera: Intrinsics, source_from_view: Array) -> View:
 
 def _cropped(camera: Intrinsics, view: View) -> View | None:
     """The view without rows and columns that show nothing of the source; None where all are such."""
-    step = max(1, view.camera.width // 256)
+    step = max(1, view.camera.width // 96)
     grid = np.arange(step / 2, view.camera.width, step)
     seen = seen_at(camera, _rays(view, *np.meshgrid(grid, grid)))[1]
     if not seen.any():
@@ -203,7 +214,8 @@ def cut_images(capture: Capture, out: Path, threads: int, progress: Progress = S
     made = dict(share(cut, indices, at_once))
     every = [view for i, frame in enumerate(capture.frames) for view in made.get(i, [frame])]
     deep = sum(frame.depth is not None and _is_panorama(frame) for frame in frames.values())
-    remark = [f"the depth of {counted(deep, 'panorama')} is not used, since it is not measured along one axis"] if deep else []
+    remark = [f"{capture.extra[CUT]}; the views lie in the run's frames/{VIEWS}, and exported cameras are theirs"]
+    remark += [f"the depth of {counted(deep, 'panorama')} is not used, since it is not measured along one axis"] if deep else []
     return check_capture(capture.with_frames(every, *remark), progress)
 
 
@@ -291,7 +303,7 @@ def _nearest(values: Array, camera: Intrinsics, view: View) -> Array:
     return np.where(seen, values[row, column], values.dtype.type(0))
 
 
-@lru_cache(maxsize=32)
+@lru_cache(maxsize=16)
 def _maps(camera: Intrinsics, view: View) -> tuple[Array, Array, Array]:
     """Where each pixel of a view lies in the image of `camera`: maps (h, w) float32 in OpenCV's whole-number coordinates, and whether it
     does, (h, w) bool."""
