@@ -12,6 +12,7 @@ import numpy as np
 from fieldfuse import steps
 from fieldfuse.capture.photos import with_unposed
 from fieldfuse.capture.prepare import limited
+from fieldfuse.capture.sphere import SIDE, to_cut
 from fieldfuse.capture.storage import capture_from_dict, capture_to_dict, load_views, save_views
 from fieldfuse.capture.types import Capture, Frame, Views
 from fieldfuse.effects.correct import Corrections
@@ -101,6 +102,10 @@ def choose_frames(job: Job, capture: Capture) -> Capture:
     folder = job.folder / "frames"
     path = folder / "capture.json"
 
+    depends: Any = job.settings.capture.max_frames if capture.filmed else pixel_state(capture)
+    if to_cut(capture) and (job.settings.capture.image_size or 0) > SIDE:
+        depends = [depends, job.settings.capture.image_size]
+
     def make() -> Capture:
         steps.set_seeds(job.settings.seed)
         return steps.write_frames(capture, job.folder.path, job.settings, job.progress)
@@ -116,7 +121,7 @@ def choose_frames(job: Job, capture: Capture) -> Capture:
             save=save,
             load=lambda: in_folder(capture_from_dict(read_json(path)), folder),
             inputs=["capture"],
-            settings=job.settings.capture.max_frames if capture.filmed else pixel_state(capture),
+            settings=depends,
         )
     )
 

@@ -200,7 +200,8 @@ def directions_of(intrinsics: Intrinsics, pixels: Array) -> Array:
     if intrinsics.lens == FISHEYE:
         radius = np.hypot(x, y)
         angles = np.linspace(0, _fisheye_limit(intrinsics), 8193)  # inverted by a table: to a thousandth of a pixel, and better
-        angle = np.interp(radius, _fisheye_radius(intrinsics, angles), angles)
+        with np.errstate(over="ignore", invalid="ignore"):
+            angle = np.interp(radius, _fisheye_radius(intrinsics, angles), angles)
         aside = np.sin(angle) / np.maximum(radius, 1e-12)
         return np.stack([x * aside, y * aside, np.cos(angle)], axis=1)
     if intrinsics.distorted:

@@ -124,14 +124,14 @@ def write_frames(capture: Capture, folder: Path, settings: Settings, progress: P
     """The capture with images in `folder/frames`: chosen from a video or film, converted from HEIF and mirrored ones, or cut into views."""
     from fieldfuse.capture.convert import convert_images, to_convert
     from fieldfuse.capture.select import select_frames
-    from fieldfuse.capture.sphere import cut_images, to_cut
+    from fieldfuse.capture.sphere import SIDE, cut_images, to_cut
 
     threads = settings.threads or os.cpu_count() or 1
     if capture.filmed:
         capture = select_frames(capture, folder, settings.capture, progress)
     if to_convert(capture):
         capture = convert_images(capture, folder, threads, progress)
-    return cut_images(capture, folder, threads, progress) if to_cut(capture) else capture
+    return cut_images(capture, folder, threads, progress, max(SIDE, settings.capture.image_size or 0)) if to_cut(capture) else capture
 
 
 def uses_given_poses(capture: Capture, settings: Settings) -> bool:

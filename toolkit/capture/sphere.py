@@ -17,7 +17,7 @@ import cv2
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from fieldfuse.camera import EQUIRECTANGULAR, FISHEYE, WIDEST, Array, Intrinsics, seen_at
+from fieldfuse.camera import EQUIRECTANGULAR, FISHEYE, Array, Intrinsics, directions_of, seen_at
 from fieldfuse.capture.calibration import fitted
 from fieldfuse.capture.checks import check_capture
 from fieldfuse.capture.convert import MOST_AT_ONCE, PIXELS_AT_ONCE, save_image, still_good
@@ -31,7 +31,8 @@ from fieldfuse.threads import share
 
 VERSION = 1  # of what is cut, and how
 VIEWS = "views"  # folder of the views, in the run's `frames`
-SIDE = 1024  # pixels of a view at most
+SIDE = 1024  # pixels of a view at most, unless larger images are wanted
+MOST_SIDE = 100_000  # pixels, before that
 FIELD = 90.0  # degrees across a view
 ENOUGH = 0.95  # of the solid angle that a lens shows: what its views have to keep
 AROUND = 6  # views of a panorama along the horizon
@@ -55,12 +56,12 @@ class View:
 
 
 @lru_cache(maxsize=64)
-def views_of(camera: Intrinsics) -> tuple[tuple[View, ...], float]:
-    """The views that an image of a panorama's or fisheye camera is cut into, and the share of the solid angle it shows that they keep. No
-    views: the image is used as it is, since its own pinhole image keeps enough (`share_of_pinhole`)."""
+def views_of(camera: Intrinsics, side: int = SIDE) -> tuple[tuple[View, ...], float]:
+    """The views, of at most `side` pixels each, that a panorama or fisheye image is cut into, and the share of the solid angle it shows that
+    they keep. No views: the image is used as it is, since its own pinhole image keeps enough (`share_of_pinhole`)."""
     if camera.lens == EQUIRECTANGULAR:
         turns = [*(_looking(0, 360 * k / AROUND) for k in range(AROUND)), _looking(90, 0)]
-        return (made := tuple(_square(camera, turn) for turn in turns)), _kept(camera, made)
+        return (made := _limited([_square(camera, turn) for turn in turns], side)), _kept(camera, made)
     if camera.lens != FISHEYE or share_of_pinhole(camera) >= ENOUGH:
         return (), 1.0
     # Each image of a capture may have a camera of its own, and they hardly differ: what is searched for is searched for once.
@@ -68,8 +69,9 @@ def views_of(camera: Intrinsics) -> tuple[tuple[View, ...], float]:
     alike = camera.scaled(width, height)
     rounded = {name: round(getattr(alike, name)) for name in ("fx", "fy", "cx", "cy")}
     turns = _turns(replace(alike, **rounded, distortion=tuple(round(value, 2) for value in camera.distortion)))
-    cropped = tuple(view for turn in turns if (view := _cropped(camera, _square(camera, turn))) is not None)
-    return cropped, _kept(camera, cropped)
+    cropped = [view for turn in turns if (view := _cropped(camera, _square(camera, turn))) is not None]
+    made = _limited(cropped, side if len(cropped) > 1 else max(side, camera.width, camera.height))
+    return made, _kept(camera, made)
 
 
 @lru_cache(maxsize=64)
@@ -103,11 +105,18 @@ def _tilted(tilt: float, towards: float) -> Array:
 
 
 def _square(camera: Intrinsics, source_from_view: Array) -> View:
-    """A view of `FIELD`, with the pixels that the source has in the middle, or `SIDE`."""
+    """A view of `FIELD`, with the pixels that the source has in the middle."""
     half = math.tan(math.radians(FIELD) / 2)
-    side = max(16, min(SIDE, math.floor(2 * half * math.sqrt(camera.fx * camera.fy))))
+    side = int(np.clip(2 * half * math.sqrt(camera.fx * camera.fy), 16, MOST_SIDE))
     focal = side / (2 * half)
     return View(Intrinsics(side, side, focal, focal, side / 2, side / 2), source_from_view)
+
+
+def _limited(views: list[View], side: int) -> tuple[View, ...]:
+    """The views, all made smaller by the same factor where the largest has more pixels than `side`."""
+    factor = min(1.0, side / max((max(view.camera.width, view.camera.height) for view in views), default=side))
+    sizes = [(max(1, round(view.camera.width * factor)), max(1, round(view.camera.height * factor))) for view in views]
+    return tuple(replace(view, camera=view.camera.scaled(*size)) for view, size in zip(views, sizes, strict=True))
 
 
 def _cropped(camera: Intrinsics, view: View) -> View | None:
@@ -150,7 +159,10 @@ def _kept(camera: Intrinsics, views: tuple[View, ...]) -> float:
 def _shown(camera: Intrinsics) -> Array:
     """(N, 3) evenly spread directions in a camera's axes that its image shows, of a panorama all."""
     index = np.arange(SAMPLES) + 0.5
-    lowest = -1.0 if camera.lens == EQUIRECTANGULAR else math.cos(WIDEST)
+    lowest = -1.0
+    if camera.lens != EQUIRECTANGULAR:
+        corners = np.array([(u, v) for u in (0, camera.width) for v in (0, camera.height)], dtype=np.float64)
+        lowest = float(directions_of(camera, corners)[:, 2].min())
     z, angle = 1 - (1 - lowest) * index / SAMPLES, index * np.pi * (3 - np.sqrt(5))
     flat = np.sqrt(1 - z * z)
     every = np.stack([flat * np.cos(angle), flat * np.sin(angle), z], axis=1)
@@ -180,8 +192,9 @@ def announced(capture: Capture) -> Capture:
     return replace(capture, extra={**capture.extra, CUT: text})
 
 
-def cut_images(capture: Capture, out: Path, threads: int, progress: Progress = SILENT) -> Capture:
-    """The capture with every frame of `to_cut` replaced by its views, as JPEG (with alpha: PNG) in `out/frames/views`, in sRGB and upright.
+def cut_images(capture: Capture, out: Path, threads: int, progress: Progress = SILENT, side: int = SIDE) -> Capture:
+    """The capture with every frame of `to_cut` replaced by its views (`views_of`), as JPEG (with alpha: PNG) in `out/frames/views`, in sRGB
+    and upright.
 
     Views of a frame have its pose, turned; their masks leave out what the lens does not show; depth becomes that along the view's own axis,
     and of panoramas is left out. What is there and is of the same file is not written again.
@@ -197,14 +210,15 @@ def cut_images(capture: Capture, out: Path, threads: int, progress: Progress = S
     folder = Path(out) / "frames" / VIEWS
     frames = dict(zip(indices, (capture.frames[i] for i in indices), strict=True))
     names = {i: _names(frame) for i, frame in frames.items()}
-    states = {i: fingerprint(VERSION, SIDE, frame.intrinsics, exif, *_state(frame)) for i, frame in frames.items()}
+    states = {i: fingerprint(VERSION, side, frame.intrinsics, exif, *_state(frame)) for i, frame in frames.items()}
     done = still_good(folder, {name: states[i] for i in indices for name in names[i]})
     finished = 0
 
     def cut(index: int) -> tuple[int, list[Frame]]:
         nonlocal finished
         progress.check()
-        written = list(_cut(frames[index], capture, folder, {name: done.get(name) for name in names[index]}))
+        where = {folder / name: done.get(name) for name in names[index]}
+        written = list(_cut(frames[index], capture, where, side))
         finished += 1
         progress.update(finished, len(indices), f"views of {finished} of {counted(len(indices), 'picture')}")
         return index, written
@@ -234,18 +248,18 @@ def _state(frame: Frame) -> list[object]:
     return [frame.image, frame.mask or "", frame.depth or "", frame.confidence or "", shown, frame.mask_excludes]
 
 
-def _cut(frame: Frame, capture: Capture, folder: Path, done: dict[str, Path | None]) -> Iterator[Frame]:
-    """The views of a frame, written unless they are `done` (name → file)."""
+def _cut(frame: Frame, capture: Capture, done: dict[Path, Path | None], side: int) -> Iterator[Frame]:
+    """The views of a frame, written unless they are `done` (file without its suffix → file)."""
     exif, camera = turns_by_exif(capture), frame.intrinsics
     assert camera is not None
-    views, _ = views_of(camera)
-    missing = [name for name, path in done.items() if path is None]
+    views, _ = views_of(camera, side)
+    missing = [target for target, path in done.items() if path is None]
     image = load_image(frame, exif=exif) if missing else None
     allowed = load_mask(frame, exif=exif) if missing and not frame.mask_is_alpha else None
     deep = frame.depth is not None and not _is_panorama(frame)
     depth = load_depth(frame, capture) if missing and deep else None
-    for (name, path), view in zip(done.items(), views, strict=True):
-        mask_path, depth_path = folder / "mask" / f"{name}.png", folder / "depth" / f"{name}.npy"
+    for (target, path), view in zip(done.items(), views, strict=True):
+        mask_path, depth_path = target.parent / "mask" / f"{target.name}.png", target.parent / "depth" / f"{target.name}.npy"
         if path is None:
             assert image is not None
             if depth is not None:
@@ -255,11 +269,11 @@ def _cut(frame: Frame, capture: Capture, folder: Path, done: dict[str, Path | No
             if allowed is not None:
                 seen &= _nearest(allowed, camera, view)
             _remove_or_save_mask(mask_path, seen)
-            path = save_image(pixels, folder / name, frame.image)  # last: where it is, the others are
+            path = save_image(pixels, target, frame.image)  # last: where it is, the others are
         pose = np.eye(4)
         pose[:3, :3] = view.source_from_view
         yield Frame(
-            name=name,
+            name=target.name,
             image=path.resolve(),
             intrinsics=view.camera,
             world_from_camera=None if frame.world_from_camera is None else frame.world_from_camera @ pose,
