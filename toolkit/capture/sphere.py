@@ -57,7 +57,7 @@ class View:
 
 @lru_cache(maxsize=64)
 def views_of(camera: Intrinsics, side: int = SIDE) -> tuple[tuple[View, ...], float]:
-    """The views, of at most `side` pixels each, that a panorama or fisheye image is cut into, and the share of the solid angle it shows that
+    """The views, of at most `side` pixels each, that a panorama or fisheye image is cut into, and the share of the solid angle shown that
     they keep. No views: the image is used as it is, since its own pinhole image keeps enough (`share_of_pinhole`)."""
     if camera.lens == EQUIRECTANGULAR:
         turns = [*(_looking(0, 360 * k / AROUND) for k in range(AROUND)), _looking(90, 0)]
@@ -185,7 +185,8 @@ def announced(capture: Capture) -> Capture:
     if not cameras:
         return capture
     numbers, kept = {len(views_of(camera)[0]) for camera in cameras}, min(views_of(camera)[1] for camera in set(cameras))
-    kind = {(EQUIRECTANGULAR,): "360°", (FISHEYE,): "fisheye"}.get(tuple({camera.lens for camera in cameras}), "wide")
+    lenses = {camera.lens for camera in cameras}
+    kind = "wide" if len(lenses) > 1 else "360°" if EQUIRECTANGULAR in lenses else "fisheye"
     many = counted(len(cameras), f"{kind} picture")
     into = " or ".join(str(number) for number in sorted(numbers))
     text = f"each of {many} is cut into {into} views; {100 * kept:.0f}% of what it shows is kept"

@@ -106,7 +106,7 @@ class Job:
         """The ids in the database of the cameras of all images that are views of an instant, by their index: one for each view of a rig,
         whose sensors they are. Instants that were cut in the same way have the same ones."""
         first: dict[tuple[Any, ...], int] = {}
-        out = {}
+        out = dict[int, int]()
         for views in self.instants:
             frames = [self.images[index] for index in views]
             if frames[0].instant is not None:

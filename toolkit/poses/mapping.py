@@ -290,7 +290,8 @@ def _intrinsics(camera: pycolmap.Camera) -> Intrinsics:
     if camera.model_name == "OPENCV":
         fx, fy, cx, cy, *lens = values
     elif camera.model_name == "PINHOLE":
-        return Intrinsics(int(camera.width), int(camera.height), *values)
+        fx, fy, cx, cy = values
+        return Intrinsics(int(camera.width), int(camera.height), fx, fy, cx, cy)
     elif camera.model_name == "SIMPLE_RADIAL":
         fx, cx, cy, k = values
         fy, lens = fx, [k, 0.0, 0.0, 0.0]
