@@ -7,6 +7,7 @@ from pathlib import Path
 
 import cv2
 import numpy as np
+import pycolmap
 import pytest
 
 from fieldfuse.camera import EQUIRECTANGULAR, FISHEYE, PINHOLE, Array, Intrinsics, directions_of, pixel_grid, project, seen_at
@@ -39,6 +40,19 @@ def test_directions_lie_in_a_panorama_by_longitude_and_latitude(direction: tuple
     np.testing.assert_allclose(found, pixel, atol=1e-9)
     assert seen
     assert seen_at(PANORAMA, np.array([0.0, -1.0, 0.0]))[0][1] == 0  # straight up: the first row
+
+
+@pytest.mark.parametrize(
+    ("model", "own"),
+    [("EQUIRECTANGULAR", PANORAMA), ("OPENCV_FISHEYE", Intrinsics(800, 400, 250.0, 260.0, 410.0, 190.0, FISHEYE, (0.03, -0.01, 0.0, 0.0)))],
+)
+def test_colmap_puts_directions_where_we_do(model: str, own: Intrinsics) -> None:
+    theirs = pycolmap.Camera.create_from_model_name(0, model, 250.0, 800, 400)
+    if own.lens == FISHEYE:
+        theirs.params = [own.fx, own.fy, own.cx, own.cy, *own.distortion]
+    rays = np.random.default_rng(2).normal(size=(200, 3)) * [1, 1, 1.0 if own.lens == EQUIRECTANGULAR else 0] + [0, 0, 0.7]
+    for ray, pixel in zip(rays, seen_at(own, rays)[0], strict=True):
+        np.testing.assert_allclose(theirs.img_from_cam(ray), pixel, atol=1e-6)
 
 
 def test_a_fisheye_lens_is_opencvs_and_shows_what_lies_beside_the_camera() -> None:
