@@ -36,12 +36,17 @@ def info(
     options: Options,
 ) -> None:
     """Tell what was detected: kind, counts, sizes, lenses, depth, warnings."""
+    from fieldfuse.capture.unpack import unpacked
     from fieldfuse.pipelines.folder import is_run_folder
 
     quiet = options.quiet or options.json
-    data = run_facts(target) if is_run_folder(target) else source_facts(target, fast, quiet)
-    if effects:
-        data["effects"] = effects_facts(target, quiet)
+    with unpacked(target) as place:
+        data = run_facts(target) if is_run_folder(target) else source_facts(place, fast, quiet)
+        if effects:
+            data["effects"] = effects_facts(place, quiet)
+    if place != target:
+        data["source"] = str(target)
+        data["warnings"] = [text.replace(str(place), str(target)) for text in data["warnings"]]
     if options.json:
         typer.echo(writer.dumps(data, indent=1))
         return
