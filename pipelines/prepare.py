@@ -24,10 +24,12 @@ from fieldfuse.pipelines.job import Job
 from fieldfuse.pipelines.schemas import Effects, read_checked
 from fieldfuse.pipelines.source import pixel_state, source_state
 from fieldfuse.pipelines.stages import InPlaceStage, Stage
+from fieldfuse.poses import scaling
 from fieldfuse.poses.check_given import VERSION as CHECKED
 from fieldfuse.poses.job import VERSION
 from fieldfuse.poses.points import Features
-from fieldfuse.poses.result import PoseResult
+from fieldfuse.poses.result import SFM, PoseResult
+from fieldfuse.poses.scaling import Scaling, wanted
 from fieldfuse.poses.scene import Scene, describe_scene
 
 EFFECTS_FILE = "effects.json"
@@ -61,7 +63,7 @@ def prepare(job: Job, capture: Capture | None = None) -> Prepared:
     """Everything up to the views; `capture`: from `find_capture`, where that was called before."""
     features: dict[str, Features] = {}  # of images by name, as they are extracted on the way
     capture = choose_frames(job, find_capture(job) if capture is None else capture)
-    poses = find_camera_poses(job, capture, features)
+    capture, poses = find_scaling(job, capture, find_camera_poses(job, capture, features))
     posed = limited(poses.apply(capture), job.settings.capture.holdout, job.settings.views.limit)
     corrections = find_effects(job, posed)
     poses, posed = steps.refined(poses, corrections), corrections.on_capture(posed)
@@ -74,7 +76,8 @@ def prepare(job: Job, capture: Capture | None = None) -> Prepared:
 def find_capture(job: Job) -> Capture:
     """Detect what the source is, read it, look at every image once (at those that `choose_frames` writes, then)."""
     path = job.folder / "capture.json"
-    masks = job.settings.capture.masks
+    masks, depth_scale = job.settings.capture.masks, job.settings.capture.depth_scale
+    besides = [*([masks] if masks != "auto" else []), *([str(depth_scale)] if depth_scale is not None else [])]
     state = source_state(job.source, job.folder.path)
     found = job.run(
         Stage(
@@ -82,7 +85,7 @@ def find_capture(job: Job) -> Capture:
             make=lambda: steps.read_capture(job.source, job.settings, job.progress),
             save=lambda capture: [_written(path, capture_to_dict(capture))],
             load=lambda: capture_from_dict(read_json(path)),
-            settings=state if masks == "auto" else [state, masks],
+            settings=[state, *besides] if besides else state,
         )
     )
     return with_unposed(found) if job.settings.poses.source == "sfm" else found
@@ -146,7 +149,8 @@ def find_camera_poses(job: Job, capture: Capture, features: dict[str, Features] 
     if given:
         depends += [CHECKED, settings.poses.convention]  # the files are in the stages before
     else:
-        found = {name: value for name, value in asdict(settings.poses).items() if name != "convention"}
+        besides = ("convention", "scale", "marker", "gps")  # which change nothing of what is found here
+        found = {name: value for name, value in asdict(settings.poses).items() if name not in besides}
         depends += [VERSION, found, settings.seed, pixel_state(capture)]
     return job.run(
         InPlaceStage(
@@ -158,6 +162,29 @@ def find_camera_poses(job: Job, capture: Capture, features: dict[str, Features] 
             settings=depends,
         )
     )
+
+
+def find_scaling(job: Job, capture: Capture, poses: PoseResult) -> tuple[Capture, PoseResult]:
+    """Capture and poses in metres, and placed on earth, where measured distances, markers or the images' GPS allow it."""
+    settings, path = job.settings.poses, job.folder / "scaling.json"
+    scene = job.stages.record("scene")
+    if scene is not None and "scene" in job.stages.trusted and scene.after.get("poses") == job.stages.records["poses"].made:
+        there = "scaling" in scene.after  # what the folder's results stand on, whatever images and settings are now
+    else:
+        there = wanted(capture, settings, poses.source == SFM)
+    if not there:
+        return capture, poses
+    found = job.run(
+        Stage(
+            "scaling",
+            make=lambda: scaling.find_scaling(capture, poses, settings, job.progress),
+            save=lambda found: [_written(path, found.to_dict())],
+            load=lambda: Scaling.from_dict(read_json(path)),
+            inputs=["poses"],
+            settings=[settings.scale, settings.marker, settings.gps, pixel_state(capture)],
+        )
+    )
+    return found.apply(capture, poses)
 
 
 def find_effects(job: Job, posed: Capture) -> Corrections:
@@ -176,7 +203,7 @@ def find_effects(job: Job, posed: Capture) -> Corrections:
             make=make,
             save=lambda data: [_written(path, data)],
             load=partial(read_checked, path, Effects),
-            inputs=["poses"],
+            inputs=job.stages.done("poses", "scaling"),
             settings=[asdict(settings.effects), settings.capture.holdout, [frame.name for frame in posed.frames], pixel_state(posed)],
             version=4,
         )
@@ -205,7 +232,7 @@ def measure_scene(job: Job, posed: Capture, features: dict[str, Features] | None
             make=make,
             save=lambda scene: [_written(path, scene.to_dict())],
             load=lambda: Scene.from_dict(read_json(path)),
-            inputs=job.stages.done("poses", "effects"),
+            inputs=job.stages.done("poses", "scaling", "effects"),
             settings=limit_of(job),
         )
     )
@@ -235,7 +262,7 @@ def make_views(job: Job, posed: Capture, scene: Scene, corrections: Corrections 
             make=lambda: steps.prepared(posed, scene, job.settings, job.progress, corrections),
             save=save,
             load=load,
-            inputs=job.stages.done("poses", "effects", "scene"),
+            inputs=job.stages.done("poses", "scaling", "effects", "scene"),
             settings=[settings.image_size, settings.holdout, limit_of(job), pixel_state(posed)],
         )
     )

@@ -29,6 +29,7 @@ if TYPE_CHECKING:
     from fieldfuse.nerfusion.keyframes import KeyFrames
     from fieldfuse.poses.points import Features
     from fieldfuse.poses.result import PoseResult
+    from fieldfuse.poses.scaling import Scaling
     from fieldfuse.poses.scene import Scene
     from fieldfuse.training.from_network import Inference
 
@@ -102,9 +103,10 @@ def read_capture(source: Path, settings: Settings, progress: Progress = SILENT) 
     from fieldfuse.capture import open_capture
     from fieldfuse.capture.checks import check_capture
     from fieldfuse.capture.convert import to_convert
+    from fieldfuse.capture.depth_checks import with_depth_scale
     from fieldfuse.poses.check_given import best_fitting
 
-    capture = open_capture(source, settings.capture.masks, best_fitting)
+    capture = with_depth_scale(open_capture(source, settings.capture.masks, best_fitting), settings.capture.depth_scale)
     return capture if to_convert(capture) else check_capture(capture, progress)
 
 
@@ -143,11 +145,26 @@ def camera_poses(
     """
     from fieldfuse.poses.check_given import check_given
     from fieldfuse.poses.result import given_poses
+    from fieldfuse.poses.scaling import check_measures
     from fieldfuse.poses.sfm import find_poses
 
+    check_measures(capture, settings.poses)
     if uses_given_poses(capture, settings):
         return check_given(capture, given_poses(capture), settings.poses.convention, progress, {} if features is None else features)
     return find_poses(capture, folder, settings.poses, settings.seed, settings.threads, progress)
+
+
+def find_scaling(capture: Capture, poses: PoseResult, settings: Settings, progress: Progress = SILENT) -> Scaling | None:
+    """What makes the poses metric and places them on earth: measured distances, markers, the images' GPS. None: there is none of it.
+
+    Raises:
+        InputError: what the settings name cannot be found in the images.
+    """
+    from fieldfuse.poses import scaling
+
+    if not scaling.wanted(capture, settings.poses, poses.source == "sfm"):
+        return None
+    return scaling.find_scaling(capture, poses, settings.poses, progress)
 
 
 def find_effects(posed: Capture, settings: Settings, progress: Progress = SILENT) -> dict[str, Any]:
