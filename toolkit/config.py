@@ -260,6 +260,11 @@ class CaptureSettings:
     masks: Annotated[str, one_of("auto", "inverted", "off")] = "auto"
     # Stored depth values to a metre (5000), or what one stands for (0.25mm); None: as the source has it, or as fits its poses
     depth_scale: Annotated[float | str, read_by(stored_per_metre)] | None = None
+    # auto: 360° panoramas are recognised, and these and fisheye images are cut into views | perspective: neither | equirectangular: all are
+    # panoramas
+    projection: Annotated[str, one_of("auto", "perspective", "equirectangular")] = "auto"
+    # What floating-point pictures hold. auto: by format, profile and values | linear: light | display: values for screens (sRGB)
+    light: Annotated[str, one_of("auto", "linear", "display")] = "auto"
 
 
 @dataclass

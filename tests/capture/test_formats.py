@@ -18,7 +18,7 @@ from fieldfuse.capture.checks import check_capture
 from fieldfuse.capture.headers import image_header, orientation_of, read_header, read_tiff, unturned
 from fieldfuse.capture.images import load_image, read_image, turns_by_exif
 from fieldfuse.capture.storage import capture_from_dict, capture_to_dict
-from fieldfuse.capture.types import Frame
+from fieldfuse.capture.types import CUT, Frame
 from fieldfuse.errors import InputError
 from tests.pipelines.made import make_room
 
@@ -51,7 +51,7 @@ def test_a_damaged_avif_is_refused_by_name(tmp_path: Path) -> None:
     path = tmp_path / "a" / "02.avif"
     path.write_bytes(path.read_bytes()[:-200])
     with pytest.raises(InputError, match=r"02\.avif is cut short"):
-        read_image(path)
+        read_image(Frame("", path))
 
 
 def test_floating_point_tiff_is_taken_as_0_to_1(tmp_path: Path) -> None:
@@ -124,7 +124,7 @@ def test_a_turned_tiff_is_turned_once_as_a_photo_and_never_beside_poses(orientat
     }[orientation]
     path = tmp_path / "a.tif"
     turned_tiff(path, np.ascontiguousarray(stored), orientation)
-    got, said = read_image(path)
+    got, said = read_image(Frame("", path))
     assert said == orientation == orientation_of(path)
     assert np.array_equal(got, stored)
     header = read_header(read_bytes(path), path)
@@ -192,18 +192,6 @@ def test_images_that_exif_turns_by_180_degrees_are_remarked(room: Path) -> None:
     assert not turns_by_exif(capture) and any("by 180°" in warning for warning in capture.warnings)
 
 
-def test_panoramas_are_refused_for_what_they_are(room: Path, tmp_path: Path) -> None:
-    xmp = b'<x:xmpmeta xmlns:x="adobe:ns:meta/"><GPano:ProjectionType>equirectangular</GPano:ProjectionType></x:xmpmeta>'
-    for number, path in enumerate(photos(tmp_path / "p", ".jpg", 6)):
-        Image.fromarray(np.repeat(scene(9 * number), 2, axis=1)).save(path, xmp=xmp)
-    with pytest.raises(InputError, match=r"panoramas .* are not read; cut each into perspective views"):
-        check_capture(open_capture(tmp_path / "p"))
-    path = room / "transforms.json"
-    path.write_text(json.dumps({**json.loads(path.read_text()), "camera_model": "EQUIRECTANGULAR"}))
-    with pytest.raises(InputError, match=r"panoramas .* are not read"):
-        open_capture(room)
-
-
 def test_views_that_were_cut_out_of_panoramas_pass(room: Path) -> None:
     """They may have kept its metadata, and come with cameras."""
     xmp = b'<x:xmpmeta xmlns:x="adobe:ns:meta/"><GPano:ProjectionType>equirectangular</GPano:ProjectionType></x:xmpmeta>'
@@ -217,21 +205,13 @@ def test_views_that_were_cut_out_of_panoramas_pass(room: Path) -> None:
     assert len(check_capture(open_capture(room)).frames) == 8
 
 
-def test_openexr_is_named(room: Path) -> None:
-    path = room / "transforms.json"
-    data = json.loads(path.read_text())
-    for number, entry in enumerate(data["frames"]):
-        (room / f"{number}.exr").write_bytes(b"\x76\x2f\x31\x01" + bytes(100))
-        entry["depth_file_path"] = f"{number}.exr"
-    path.write_text(json.dumps(data))
-    with pytest.raises(InputError, match="OpenEXR, which is not read; write depth as 16-bit PNG"):
-        open_capture(room)
-
-
 def test_how_much_of_a_wide_lens_is_not_used_is_said(room: Path) -> None:
     path = room / "transforms.json"
     data = json.loads(path.read_text())
     path.write_text(json.dumps({**data, "camera_model": "OPENCV_FISHEYE", "fl_x": 45.0, "fl_y": 45.0, "k1": -0.03}))
-    assert any("outside of the pinhole view" in warning for warning in check_capture(open_capture(room)).warnings)
+    plain = check_capture(open_capture(room, projection="perspective"))
+    assert any("outside of the pinhole view" in warning for warning in plain.warnings) and CUT not in plain.extra
+    cut = check_capture(open_capture(room))
+    assert not any("outside of the pinhole view" in warning for warning in cut.warnings) and "8 fisheye pictures" in cut.extra[CUT]
     path.write_text(json.dumps({**data, "camera_model": "OPENCV", "k1": -0.02}))
     assert not any("outside of the pinhole view" in warning for warning in check_capture(open_capture(room)).warnings)

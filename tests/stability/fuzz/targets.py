@@ -6,18 +6,21 @@ import json
 import shutil
 from collections.abc import Callable
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 
 import cv2
 import numpy as np
 import torch
+from PIL import Image
 
-from fieldfuse.camera import Intrinsics, Similarity
+from fieldfuse.camera import Intrinsics, Similarity, opengl_from_world
 from fieldfuse.capture import open_capture
 from fieldfuse.capture.checks import check_capture
 from fieldfuse.capture.images import load_image, load_mask
 from fieldfuse.capture.ply_points import read_ply_points
 from fieldfuse.capture.prepare import prepare_views
+from fieldfuse.capture.sphere import cut_view, to_cut, views_of
 from fieldfuse.capture.storage import capture_from_dict, capture_to_dict, load_views, save_views
 from fieldfuse.capture.types import Capture, Views
 from fieldfuse.capture.video import iterate_video, read_video
@@ -27,8 +30,10 @@ from fieldfuse.poses.result import given_poses
 from fieldfuse.render.field import Field
 from fieldfuse.render.rays import render_rays
 from fieldfuse.tone import Tone
+from tests.capture.dng import mosaic, write_dng
 from tests.capture.layouts import LAYOUTS, write_record3d, zipped
 from tests.capture.made import eyes, render, save_picture
+from tests.capture.spheres import room, walk
 from tests.stability.fuzz.given import (
     DATASETS,
     MESHES,
@@ -131,6 +136,31 @@ def make_extras(root: Path) -> None:
     (root / "transforms.json").write_text(json.dumps(data))
 
 
+def make_panoramas(root: Path) -> None:
+    """Posed panoramas, photos of panoramas with Google's XMP in a folder beside, and fisheye images."""
+    xmp = b'<x:xmpmeta xmlns:x="adobe:ns:meta/"><GPano:ProjectionType>equirectangular</GPano:ProjectionType></x:xmpmeta>'
+    for name, model in (("posed", "EQUIRECTANGULAR"), ("photos", ""), ("fisheye", "OPENCV_FISHEYE")):
+        (root / name).mkdir(parents=True)
+        frames = []
+        for number, pose in enumerate(walk(4)):
+            frames.append({"file_path": f"{number}.jpg", "transform_matrix": opengl_from_world(pose).tolist()})
+            Image.fromarray(room(Intrinsics.equirectangular(64, 32), pose)[0]).save(root / name / f"{number}.jpg", xmp=xmp)
+        lens = {"fl_x": 20.0, "fl_y": 20.0, "k1": 0.01, "k2": -0.002} if model == "OPENCV_FISHEYE" else {}
+        if model:
+            (root / name / "transforms.json").write_text(json.dumps({"camera_model": model, **lens, "frames": frames}))
+
+
+def read_panoramas(root: Path, number: int) -> None:
+    def read(folder: Path) -> None:
+        capture = check_capture(contained(open_capture(folder), folder))
+        for index in to_cut(capture):
+            frame = capture.frames[index]
+            for view in views_of(frame.intrinsics)[0]:
+                cut_view(load_image(frame), frame.intrinsics, view)
+
+    all_of(*(partial(read, root / name) for name in ("posed", "photos", "fisheye")))
+
+
 LAYOUTS_CAMERA = LAYOUTS["transforms"][1].__globals__["OFF_CENTRE"]
 PHOTOS = ("a.jpg", "b.png", "c.webp", "d.bmp", "e.tif", "f.png", "g.jpg", "h.heic")
 
@@ -154,6 +184,25 @@ def make_photos(root: Path) -> None:
     Image.fromarray(pictures[1]).save(root / "g.jpg", progressive=True)
     small = pillow_heif.from_pillow(Image.fromarray(pictures[2]))
     small.save(root / "h.heic", quality=80, exif=tags.tobytes())
+
+
+def make_exr(root: Path) -> None:
+    """OpenEXR with and without alpha, in half and full precision, by several ways to compress."""
+    import OpenEXR
+
+    root.mkdir(parents=True, exist_ok=True)
+    ways = (OpenEXR.ZIP_COMPRESSION, OpenEXR.PIZ_COMPRESSION, OpenEXR.DWAA_COMPRESSION)
+    for name, eye, way, kind in zip("abc", eyes(), ways, (np.float16, np.float32, np.float16), strict=False):
+        colours = render(eye, LAYOUTS_CAMERA)[0].astype(kind) / kind(255)
+        planes = {channel: np.ascontiguousarray(colours[..., index]) for index, channel in enumerate("RGB")}
+        planes |= {"A": np.ones((60, 80), kind)} if name == "b" else {}
+        OpenEXR.File({"compression": way, "type": OpenEXR.scanlineimage}, planes).write(str(root / f"{name}.exr"))
+
+
+def make_raw(root: Path) -> None:
+    root.mkdir(parents=True, exist_ok=True)
+    for name, eye in zip("abc", eyes(), strict=False):
+        write_dng(root / f"{name}.dng", mosaic(render(eye, LAYOUTS_CAMERA)[0].astype(np.float32) / 255))
 
 
 def read_photo_folder(root: Path, number: int) -> None:
@@ -262,11 +311,15 @@ TRAINING_FILES = (
     "shard.safetensors", "checkpoint-0000007.safetensors", "train.yaml", "depths.safetensors", "left_out.safetensors",
     "fieldfuse/speed.json",
 )  # fmt: skip
+PANORAMAS = ("posed/transforms.json", "posed/1.jpg", "photos/1.jpg", "fisheye/transforms.json", "fisheye/transforms.json")
 TARGETS: tuple[Target, ...] = (
     *(Target(layout, files, LAYOUTS[layout][1], read_capture, 1.0) for layout, files in FILES.items()),
     Target("recording", ("a.r3d",), make_recording, read_capture, 1.0),
     Target("extras", ("transforms.json", "mask1.png", "depth2.npy", "points.ply"), make_extras, read_capture, 2.0),
     Target("photos", PHOTOS, make_photos, read_photo_folder, 3.0),
+    Target("openexr", ("a.exr", "b.exr", "c.exr"), make_exr, read_photo_folder, 1.0),
+    Target("camera raw", ("a.dng", "b.dng", "c.dng"), make_raw, read_photo_folder, 1.0),
+    Target("panoramas", PANORAMAS, make_panoramas, read_panoramas, 1.0),
     Target("videos", ("a.avi", "b.mp4", "c.webm"), make_videos, read_one_video, 1.5),
     Target("run json", RUN_FILES, make_runs, read_json_files, 2.0),
     Target("results", RESULT_FILES, make_results, read_results, 2.5),
