@@ -17,6 +17,7 @@ from fieldfuse.capture.select import SELECTED
 from fieldfuse.capture.types import Capture
 from fieldfuse.errors import InputError
 from fieldfuse.export.cameras import write_cameras
+from fieldfuse.export.georeference import write_georeference
 from fieldfuse.export.surface import Originals, at_most, surface_of_field, whole_mesh
 from fieldfuse.files import write_json
 from fieldfuse.memory import require_pictures
@@ -139,6 +140,8 @@ def export_field(job: Job, ready: Prepared, fitted: Fitted, wish: Wish) -> Expor
         except InputError as error:
             undone |= surfaces
             notes.append(f"points and meshes were left out: {error}")
+    if ready.poses.georeference is not None:
+        out.files += write_georeference(folder, ready.poses.georeference)
     if "cameras" in formats:
         put_cameras(folder / "cameras", ready.poses, ready.posed, *sparse_points(folder / "points.ply"))
         out.files += [path for path in sorted((folder / "cameras").rglob("*")) if path.is_file()]
