@@ -41,7 +41,8 @@ def solid_box(shell: float) -> Field:
     half = round(SIDE / 2 / voxel)
     middle = LATTICE // 2
     places = places[((places >= middle - half) & (places < middle + half)).all(1)]
-    field = NewField(space, LATTICE, make_decoder("deferred", 16, 24), torch.tensor([0.9, 0.2, 0.4])).on(places, TorchHost(), 8.0, generator)
+    new = NewField(space, LATTICE, make_decoder("deferred", 16, 24), torch.tensor([0.9, 0.2, 0.4]))
+    field = new.on(places, TorchHost(), 8.0, generator)
     assert 2 * half * voxel == pytest.approx(SIDE)
     return replace(field, near=0.01)
 
