@@ -51,7 +51,7 @@ def test_a_damaged_avif_is_refused_by_name(tmp_path: Path) -> None:
     path = tmp_path / "a" / "02.avif"
     path.write_bytes(path.read_bytes()[:-200])
     with pytest.raises(InputError, match=r"02\.avif is cut short"):
-        read_image(path)
+        read_image(Frame("", path))
 
 
 def test_floating_point_tiff_is_taken_as_0_to_1(tmp_path: Path) -> None:
@@ -124,7 +124,7 @@ def test_a_turned_tiff_is_turned_once_as_a_photo_and_never_beside_poses(orientat
     }[orientation]
     path = tmp_path / "a.tif"
     turned_tiff(path, np.ascontiguousarray(stored), orientation)
-    got, said = read_image(path)
+    got, said = read_image(Frame("", path))
     assert said == orientation == orientation_of(path)
     assert np.array_equal(got, stored)
     header = read_header(read_bytes(path), path)
@@ -215,17 +215,6 @@ def test_views_that_were_cut_out_of_panoramas_pass(room: Path) -> None:
         image.save(room / entry["file_path"], xmp=xmp)
     path.write_text(json.dumps(data))
     assert len(check_capture(open_capture(room)).frames) == 8
-
-
-def test_openexr_is_named(room: Path) -> None:
-    path = room / "transforms.json"
-    data = json.loads(path.read_text())
-    for number, entry in enumerate(data["frames"]):
-        (room / f"{number}.exr").write_bytes(b"\x76\x2f\x31\x01" + bytes(100))
-        entry["depth_file_path"] = f"{number}.exr"
-    path.write_text(json.dumps(data))
-    with pytest.raises(InputError, match="OpenEXR, which is not read; write depth as 16-bit PNG"):
-        open_capture(room)
 
 
 def test_how_much_of_a_wide_lens_is_not_used_is_said(room: Path) -> None:

@@ -15,14 +15,13 @@ import numpy as np
 from PIL import Image, UnidentifiedImageError
 from PIL.TiffImagePlugin import ImageFileDirectory_v2
 
-from fieldfuse.capture import heif
+from fieldfuse.capture import exr, heif, raw
 from fieldfuse.capture.colours import png_colours, profile_of
 from fieldfuse.capture.poses import reads_leniently
 from fieldfuse.errors import InputError
 
 MAX_PIXELS = 200_000_000
 PANORAMA = "360° panoramas (equirectangular) are not read; cut each into perspective views first, and give these"
-NOT_EXR = "is OpenEXR, which is not read; write depth as 16-bit PNG in millimetres or as float .npy, and images as PNG or TIFF"
 LYING = 5  # EXIF orientations from here on turn by 90°
 TIFFS = (".tif", ".tiff")
 WIDTH, HEIGHT, BITS, ORIENTATION, MAXIMUM, EXTRA, SAMPLE_FORMAT, PROFILE = 256, 257, 258, 274, 281, 338, 339, 34675  # tags of TIFF 6.0
@@ -31,7 +30,7 @@ _pillow_limit = threading.Lock()
 
 @dataclass(frozen=True)
 class Header:
-    """An image as stored, before any EXIF turn (HEIF: as it is seen)."""
+    """An image as stored, before any EXIF turn (HEIF, camera raw: as it is seen)."""
 
     width: int
     height: int
@@ -58,14 +57,16 @@ def read_header(data: bytes, path: Path) -> Header:
         InputError: not an image, more than `MAX_PIXELS` pixels, the file ends before the image does, or pillow-heif is not installed.
     """
     cut_short = InputError(f"the image {path} is cut short (the file ends before the image does); copy it again or remove it")
+    if raw.is_raw(path):
+        return _within_limits(Header(*raw.raw_size(data, path), raw.FORMAT, deep=True), path)
     if heif.is_heif(data):
         heif.register(path)
     if heif.is_heif(data) or data[4:12] in (b"ftypavif", b"ftypavis"):
         end = end_of_boxes(io.BytesIO(data), len(data))
         if end is not None and end > len(data):
             raise cut_short
-    if data[:4] == b"\x76\x2f\x31\x01":
-        raise InputError(f"{path} {NOT_EXR}")
+    if data[:4] == exr.MAGIC:
+        return _within_limits(_of_exr(exr.exr_header(data, path)), path)
     header = read_tiff(data)
     try:
         # Pillow's own limit is lower than ours and global; it is lifted for the header only, and ours is applied below.
@@ -84,15 +85,23 @@ def read_header(data: bytes, path: Path) -> Header:
             raise InputError(f"{path} is not an image that can be read; convert it to JPEG or PNG, or remove it") from error
     except Exception as error:  # Pillow's parsers raise many families on damaged headers
         raise InputError(f"the header of the image {path} is damaged; copy it again or remove it") from error
+    if not _complete(data, _within_limits(header, path).format):
+        raise cut_short
+    return header
+
+
+def _within_limits(header: Header, path: Path) -> Header:
     width, height = header.size
     if width * height > MAX_PIXELS:
         most = f"{MAX_PIXELS // 10**6} megapixels"
         raise InputError(f"the image {path} has {width}×{height} pixels, more than the {most} that are read; make it smaller")
     if width < 1 or height < 1:
         raise InputError(f"the image {path} has no pixels ({width}×{height}); remove it")
-    if not _complete(data, header.format):
-        raise cut_short
     return header
+
+
+def _of_exr(found: exr.ExrHeader) -> Header:
+    return Header(*found.size, exr.FORMAT, deep=True, floating=True, alpha="a" in found.names)
 
 
 def image_header(path: Path) -> Header:
@@ -105,9 +114,15 @@ def image_header(path: Path) -> Header:
     if heif.file_is_heif(path):
         heif.register(path)
     suffix = path.suffix.lower()
-    if suffix == ".exr":
-        raise InputError(f"{path} {NOT_EXR}")
+    if suffix == exr.SUFFIX:
+        exr.package(path)
+    if raw.is_raw(path):
+        raw.package(path)
     try:
+        if suffix == exr.SUFFIX:
+            return _of_exr(exr.exr_head(path))
+        if raw.is_raw(path):
+            return Header(*raw.raw_size(path.read_bytes(), path), raw.FORMAT, deep=True)
         if suffix == ".npy":
             height, width = np.load(path, mmap_mode="r", allow_pickle=False).shape[:2]
             return Header(int(width), int(height), "NPY")
@@ -142,9 +157,9 @@ def is_panorama(data: bytes, header: Header, posed: bool) -> bool:
 
 
 def orientation_of(path: Path) -> int:
-    """The EXIF orientation of an image file, with only its header read. 1 also for HEIF, which is decoded upright, and for a file that
-    cannot be read, which is reported where it is decoded."""
-    if heif.file_is_heif(path):
+    """The EXIF orientation of an image file, with only its header read. 1 also for HEIF and camera raw, which are decoded upright, and for
+    a file that cannot be read, which is reported where it is decoded."""
+    if heif.file_is_heif(path) or raw.is_raw(path):
         return 1
     try:
         if path.suffix.lower() in TIFFS and (tiff := read_tiff(path.read_bytes())) is not None:
