@@ -59,14 +59,14 @@ def _predicted(grid: Array, there: Array, at: tuple[Array, ...]) -> Array:
     beside = [look(axis) for axis in range(3)]
     pairs = [look(*pair) for pair in PLANES]
     across, deep = look(0, 1, 2)
-    count = sum(known.astype(np.int16) for _, known in beside)
-    total = sum(np.where(known[:, None], value, 0) for value, known in beside)
-    out = (2 * total + count[:, None]) // np.maximum(2 * count, 1)[:, None]
-    flat = np.zeros(len(count), bool)
+    count: Array = np.sum([known for _, known in beside], 0, dtype=np.int16)
+    total: Array = np.sum([np.where(known[:, None], value, 0) for value, known in beside], 0, dtype=np.int16)
+    out: Array = (2 * total + count[:, None]) // np.maximum(2 * count, 1)[:, None]
+    flat: Array = np.zeros(len(count), bool)
     for (value, known), (one, two) in zip(pairs, PLANES, strict=True):
-        here = known & beside[one][1] & beside[two][1] & ~flat
+        here: Array = known & beside[one][1] & beside[two][1] & ~flat
         out[here] = (3 * (beside[one][0] + beside[two][0]) - 2 * value + 2)[here] >> 2
         flat |= here
-    whole = deep & np.all([known for _, known in (*beside, *pairs)], 0)
-    out[whole] = (10 * total - 5 * sum(value for value, _ in pairs) + across + 8)[whole] >> 4
-    return np.clip(out, 0, 255)
+    whole: Array = deep & np.all([known for _, known in (*beside, *pairs)], 0)
+    out[whole] = (10 * total - 5 * np.sum([value for value, _ in pairs], 0, dtype=np.int16) + across + 8)[whole] >> 4
+    return np.asarray(np.clip(out, 0, 255))

@@ -7,6 +7,7 @@ const make = (name, values = {}, ...inside) => {
 };
 const PATH_SIDE = 1280;  // long side in pixels of a path's pictures
 const BRIEF = 3000;  // milliseconds of a message
+const CURVE = 96;  // lines that a path is drawn by
 const CLICK = 5;  // pixels that a hand may move in a click
 const EDGES = [0, 1, 2, 3, 4, 5, 6, 7].flatMap(a => [1, 2, 4].filter(bit => !(a & bit)).map(bit => [a, a | bit]));
 
@@ -159,6 +160,7 @@ class Tools {
     $('clear').onclick = () => { this.steps = []; this.listPath(); };
     $('play').onclick = () => this.page.fly(this.page.flight === null ? this.flight() : null);
     $('path-save').onclick = () => this.download('camera_path.json', this.path());
+    $('closed').onchange = () => this.page.over();
     $('path-load').onclick = () => this.load((found, data) => {
       this.steps = found.map(one => one.pose);
       for (const [id, value] of [['seconds', data.seconds], ['fps', data.fps]]) if (value > 0) $(id).value = value;
@@ -174,6 +176,7 @@ class Tools {
       make('button', {textContent: '✕', title: `Delete view ${i + 1}`, ariaLabel: `Delete view ${i + 1}`, onclick: () => { this.steps.splice(i, 1); this.listPath(); }}))));
     for (const id of ['play', 'clear', 'path-save']) $(id).disabled = !this.steps.length;
     this.page.fly(null);
+    this.page.over();
   }
 
   get seconds() { return Math.max(0.1, Math.min(3600, Number($('seconds').value) || 10)); }
@@ -281,6 +284,10 @@ class Tools {
         const [p] = project(...Array(2).fill(times(plus(...this.points), 0.5)));
         out += line(...this.points) + (p ? `<text x="${p[0]}" y="${p[1] - 12}">${this.lengthText}</text>` : '');
       }
+    }
+    if (!$('path').hidden && this.steps.length > 1) {
+      const route = new Route(this.steps, $('closed').checked), places = Array.from({length: CURVE + 1}, (_, i) => route.at(i / CURVE).place);
+      out += places.slice(1).map((place, i) => line(places[i], place)).join('') + this.steps.map(pose => dot(pose.place)).join('');
     }
     if (!$('crop').hidden) {
       out += EDGES.map(([a, b]) => line(this.corner(a), this.corner(b))).join('');
