@@ -59,8 +59,8 @@ def _predicted(grid: Array, there: Array, at: tuple[Array, ...]) -> Array:
     beside = [look(axis) for axis in range(3)]
     pairs = [look(*pair) for pair in PLANES]
     across, deep = look(0, 1, 2)
-    count: Array = np.sum([known for _, known in beside], 0, dtype=np.int16)
-    total: Array = np.sum([np.where(known[:, None], value, 0) for value, known in beside], 0, dtype=np.int16)
+    count: Array = np.stack([known for _, known in beside]).sum(0, dtype=np.int16)
+    total: Array = np.stack([np.where(known[:, None], value, 0) for value, known in beside]).sum(0, dtype=np.int16)
     out: Array = (2 * total + count[:, None]) // np.maximum(2 * count, 1)[:, None]
     flat: Array = np.zeros(len(count), bool)
     for (value, known), (one, two) in zip(pairs, PLANES, strict=True):
@@ -68,5 +68,5 @@ def _predicted(grid: Array, there: Array, at: tuple[Array, ...]) -> Array:
         out[here] = (3 * (beside[one][0] + beside[two][0]) - 2 * value + 2)[here] >> 2
         flat |= here
     whole: Array = deep & np.all([known for _, known in (*beside, *pairs)], 0)
-    out[whole] = (10 * total - 5 * np.sum([value for value, _ in pairs], 0, dtype=np.int16) + across + 8)[whole] >> 4
+    out[whole] = (10 * total - 5 * np.stack([value for value, _ in pairs]).sum(0, dtype=np.int16) + across + 8)[whole] >> 4
     return np.asarray(np.clip(out, 0, 255))
