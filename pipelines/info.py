@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json as writer
 from collections import Counter
+from contextlib import suppress
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -37,12 +38,17 @@ def info(
     options: Options,
 ) -> None:
     """Tell what was detected: kind, counts, sizes, lenses, depth, warnings."""
+    from fieldfuse.capture.unpack import unpacked
     from fieldfuse.pipelines.folder import is_run_folder
 
     quiet = options.quiet or options.json
-    data = run_facts(target) if is_run_folder(target) else source_facts(target, fast, quiet, options.depth_scale)
-    if effects:
-        data["effects"] = effects_facts(target, quiet)
+    with unpacked(target) as place:
+        data = run_facts(target) if is_run_folder(target) else source_facts(place, fast, quiet, options.depth_scale)
+        if effects:
+            data["effects"] = effects_facts(place, quiet)
+    if place != target:
+        data["source"] = str(target)
+        data["warnings"] = [text.replace(str(place), str(target)) for text in data["warnings"]]
     if options.json:
         typer.echo(writer.dumps(data, indent=1))
         return
@@ -83,6 +89,7 @@ def source_facts(source: Path, fast: bool, quiet: bool, depth_scale: str | None 
         "lengths": LENGTHS[capture.metric or (capture.has_depth and not capture.posed)],
         "depth_scale": capture.depth_scale if capture.has_depth else None,
         "unused": unused(capture),
+        "alpha": None if fast else see_through(capture),
         "poses": agreement,
         "warnings": list(capture.warnings),
     }
@@ -97,6 +104,23 @@ def with_gps(capture: Capture) -> str | None:
     images = [frame.image for frame in capture.frames if frame.video_index is None]
     count = int(np.isfinite(gps_of_images(images)).all(axis=1).sum())
     return f"{count} of {len(images)} images have a place on earth" if count else None
+
+
+def see_through(capture: Capture) -> str | None:
+    """How much of its images a capture's alpha cuts away, by a few of them."""
+    import numpy as np
+
+    from fieldfuse.capture.images import load_image, spread
+    from fieldfuse.errors import InputError
+
+    if not capture.alpha or capture.filmed:
+        return None
+    shares = []
+    for frame in spread(capture.frames, 5):
+        with suppress(InputError):
+            image = load_image(frame)
+            shares.append(float((image[..., 3] < 128).mean()) if image.shape[2] == 4 else 0.0)
+    return f"cuts {100 * np.mean(shares or [0.0]):.0f}% of the images away (by {len(shares)} of {len(capture.frames)})"
 
 
 def check_poses(capture: Capture, progress: Progress) -> tuple[str | None, list[str]]:

@@ -13,8 +13,9 @@ from fieldfuse import steps
 from fieldfuse.capture.photos import with_unposed
 from fieldfuse.capture.prepare import limited
 from fieldfuse.capture.sphere import SIDE, to_cut
-from fieldfuse.capture.storage import capture_from_dict, capture_to_dict, load_views, save_views
+from fieldfuse.capture.storage import PATHS, capture_from_dict, capture_to_dict, load_views, save_views
 from fieldfuse.capture.types import Capture, Frame, Views
+from fieldfuse.capture.unpack import SUFFIX, UNPACKED
 from fieldfuse.effects.correct import Corrections
 from fieldfuse.errors import InputError
 from fieldfuse.files import read_json, write_json
@@ -84,9 +85,9 @@ def find_capture(job: Job) -> Capture:
     found = job.run(
         Stage(
             "capture",
-            make=lambda: steps.read_capture(job.source, job.settings, job.progress),
-            save=lambda capture: [_written(path, capture_to_dict(capture))],
-            load=lambda: capture_from_dict(read_json(path)),
+            make=lambda: steps.read_capture(job.source, job.folder.path, job.settings, job.progress),
+            save=lambda capture: [*_files_below(job.folder / UNPACKED), _written(path, capture_to_dict(capture))],
+            load=lambda: in_run(capture_from_dict(read_json(path)), job),
             settings=[state, *given] if given else state,
         )
     )
@@ -96,6 +97,26 @@ def find_capture(job: Job) -> Capture:
 def _written(path: Path, data: Any) -> Path:
     write_json(path, data)
     return path
+
+
+def _files_below(folder: Path) -> list[Path]:
+    return [path for path in sorted(folder.rglob("*")) if path.is_file()]
+
+
+def in_run(capture: Capture, job: Job) -> Capture:
+    """The capture of a zip file where its files are now: the run's folder, in which they were unpacked, may have been moved."""
+    if job.source.suffix.lower() != SUFFIX or UNPACKED not in capture.root.parts or capture.root.is_relative_to(job.folder / UNPACKED):
+        return capture
+    at = max(index for index, part in enumerate(capture.root.parts) if part == UNPACKED)
+    before, now = Path(*capture.root.parts[: at + 1]), job.folder / UNPACKED
+
+    def here(path: Path) -> Path:
+        return now / path.relative_to(before) if path.is_relative_to(before) else path
+
+    frames = [
+        replace(frame, **{name: here(path) for name in PATHS if (path := getattr(frame, name)) is not None}) for frame in capture.frames
+    ]
+    return replace(capture, root=here(capture.root), frames=tuple(frames))
 
 
 def choose_frames(job: Job, capture: Capture) -> Capture:
@@ -122,7 +143,7 @@ def choose_frames(job: Job, capture: Capture) -> Capture:
             "frames",
             make=make,
             save=save,
-            load=lambda: in_folder(capture_from_dict(read_json(path)), folder),
+            load=lambda: in_folder(in_run(capture_from_dict(read_json(path)), job), folder),
             inputs=["capture"],
             settings=depends,
         )

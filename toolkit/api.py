@@ -69,7 +69,7 @@ def load(
     folder = Path(files.name if files is not None else workdir or ".")
 
     with steps.seeded(chosen.seed):
-        capture = steps.read_capture(path.absolute(), chosen, listening(progress, "capture"))
+        capture = steps.read_capture(path.absolute(), folder, chosen, listening(progress, "capture"))
         if chosen.poses.source == "sfm":
             capture = with_unposed(capture)
         if steps.needs_frames(capture):

@@ -94,8 +94,9 @@ def choose_device(wanted: str, engine: str = "auto") -> str:
     return device
 
 
-def read_capture(source: Path, settings: Settings, progress: Progress = SILENT) -> Capture:
-    """What the source is detected to be, every image of it looked at once (those that `write_frames` writes, then).
+def read_capture(source: Path, folder: Path, settings: Settings, progress: Progress = SILENT) -> Capture:
+    """What the source is detected to be, every image of it looked at once (those that `write_frames` writes, then). A zip file is unpacked
+    into `folder/unpacked`.
 
     Raises:
         InputError: it is not readable as any known layout, or too little of it is usable.
@@ -105,13 +106,15 @@ def read_capture(source: Path, settings: Settings, progress: Progress = SILENT) 
     from fieldfuse.capture.convert import to_convert
     from fieldfuse.capture.depth_checks import with_depth_scale
     from fieldfuse.capture.light import LIGHT
+    from fieldfuse.capture.unpack import UNPACKED, unpacked
     from fieldfuse.poses.check_given import best_fitting
 
-    capture = open_capture(source, settings.capture.masks, best_fitting, settings.capture.projection)
-    capture = with_depth_scale(capture, settings.capture.depth_scale)
-    if settings.capture.light != "auto":
-        capture = replace(capture, extra={**capture.extra, LIGHT: settings.capture.light})
-    return capture if to_convert(capture) else check_capture(capture, progress)
+    with unpacked(source, folder / UNPACKED, progress) as place:
+        capture = open_capture(place, settings.capture.masks, best_fitting, settings.capture.projection)
+        capture = with_depth_scale(capture, settings.capture.depth_scale)
+        if settings.capture.light != "auto":
+            capture = replace(capture, extra={**capture.extra, LIGHT: settings.capture.light})
+        return capture if to_convert(capture) else check_capture(capture, progress)
 
 
 def needs_frames(capture: Capture) -> bool:
