@@ -47,6 +47,9 @@ EXTRAS = (
     ("heic", "pillow-heif", "photos of phones in HEIC (.heic) are not read", "pillow-heif>=1"),
     ("record3d", "imagecodecs", "recordings of Record3D with depth are not read", "imagecodecs>=2024.1"),
     ("geo", "pyproj", "UTM coordinates of captures with GPS are not written", "pyproj>=3.6"),
+    ("las", "laspy", "points are not written as LAS and LAZ", "laspy[lazrs]>=2.5"),
+    ("e57", "pye57", "points are not written as E57", "pye57>=0.4.1"),
+    ("usd", "usd-core", "the textured mesh is not written as USDZ", "usd-core>=25.2"),
     ("h264", "av", "videos are written as VP9, slowly, which not all players know", "av>=14"),
 )
 GIB = 2**30

@@ -17,6 +17,7 @@ from fieldfuse.capture.select import SELECTED
 from fieldfuse.capture.types import Capture
 from fieldfuse.errors import InputError
 from fieldfuse.export.cameras import write_cameras
+from fieldfuse.export.extras import require
 from fieldfuse.export.surface import Originals, at_most, surface_of_field, whole_mesh
 from fieldfuse.files import write_json
 from fieldfuse.memory import require_pictures
@@ -26,14 +27,16 @@ from fieldfuse.pipelines.pictures import NAME, PAGE, camera_of, orbit_cameras, p
 from fieldfuse.pipelines.prepare import Prepared
 from fieldfuse.pipelines.schemas import read_export_facts
 from fieldfuse.pipelines.stages import CollectingStage
-from fieldfuse.pipelines.surfaces import put_points
+from fieldfuse.pipelines.surfaces import in_input, put_cloud, put_points
 from fieldfuse.pipelines.textured import TEXTURED, put_textured
 from fieldfuse.poses.result import PoseResult
 from fieldfuse.tone import exposed
 
 MESHES = ("ply", "obj", "glb")  # as `export.formats` has them
 TEXTURE = "texture"
-SURFACES = {"points", *MESHES, TEXTURE}
+TEXTURES = {TEXTURE: TEXTURED, "usdz": "textured.usdz"}
+CLOUDS = ("las", "laz", "e57")
+SURFACES = {"points", *CLOUDS, *MESHES, *TEXTURES}
 MOST_TRIANGLES = 2_000_000
 MOST_SPARSE = 20_000  # points that go with exported cameras
 VIDEO_SIDE = 640
@@ -126,6 +129,12 @@ def export_field(job: Job, ready: Prepared, fitted: Fitted, wish: Wish) -> Expor
     notes: list[str] = []
     out = Exported({"mesh": None, "notes": notes})
     undone: set[str] = set()
+    for name in sorted(formats):
+        try:
+            require(name)
+        except InputError as error:
+            undone.add(name)
+            notes.append(f"{name} was left out: {error}")
     for what, names, side in needs_originals(job, formats):
         gone = missing_originals(job, ready, side)
         if gone is not None and names - undone:
@@ -135,7 +144,7 @@ def export_field(job: Job, ready: Prepared, fitted: Fitted, wish: Wish) -> Expor
     if surfaces := (formats - undone) & SURFACES:
         try:
             out.facts["mesh"], out.files = export_surface(job, ready, fitted, surfaces, notes)
-            undone |= {TEXTURE} - {TEXTURE for path in out.files if path.name == TEXTURED}
+            undone |= {name for name, file in TEXTURES.items() if folder / file not in out.files}
         except InputError as error:
             undone |= surfaces
             notes.append(f"points and meshes were left out: {error}")
@@ -176,7 +185,15 @@ def export_surface(
     volume = surface_of_field(fitted.field, ready.views, ready.scene, job.settings, originals, job.progress)
     memory.give_back()  # what images and depth maps took
     input_from_working = ready.scene.working_from_input.inverse()
-    written = [put_points(folder / "points.ply", volume.points(), input_from_working, exposure)] if "points" in formats else []
+    written = []
+    if formats & {"points", *CLOUDS}:
+        points = volume.points()
+        written += [put_points(folder / "points.ply", points, input_from_working, exposure)] if "points" in formats else []
+        for path in [folder / f"points.{kind}" for kind in CLOUDS if kind in formats]:
+            note = put_cloud(path, in_input(points, input_from_working, exposure), ready.poses.georeference)
+            notes += [] if note is None else [note]
+            written.append(path)
+        del points
     whole = whole_mesh(volume, job.settings.export.smooth)
     del volume
     mesh = whole.decimated(MOST_TRIANGLES).transformed(input_from_working)
@@ -185,12 +202,13 @@ def export_surface(
     for path in [job.folder / "mesh.ply", *(folder / f"mesh.{suffix}" for suffix in MESHES if suffix in formats)]:
         write_mesh(path, mesh)
         written.append(path)
-    if TEXTURE in formats:
+    if wanted := [folder / file for kind, file in TEXTURES.items() if kind in formats]:
         memory.give_back()
         try:
             # People who walk through belong into a texture as little as into the field.
             shown = ready if fitted.left_out is None else replace(ready, views=fitted.left_out.without(ready.views))
-            written.append(put_textured(job, shown, folder / TEXTURED, whole))
+            put_textured(job, shown, wanted, whole)
+            written += wanted
         except InputError as error:
             notes.append(f"the texture was left out: {error}")
     return facts, written
@@ -230,7 +248,7 @@ def sparse_points(path: Path) -> tuple[Array, Array] | tuple[None, None]:
 def needs_originals(job: Job, formats: Iterable[str]) -> list[tuple[str, set[str], int]]:
     """What of `formats` is made of images as they were taken: how a sentence on it begins, the formats, and the images' long side."""
     surfaces, export = SURFACES & set(formats), job.settings.export
-    found = [("points and meshes were", surfaces, export.mesh_size), ("the texture was", surfaces & {TEXTURE}, export.texture_size)]
+    found = [("points and meshes were", surfaces, export.mesh_size), ("the texture was", surfaces & TEXTURES.keys(), export.texture_size)]
     return [one for one in found if one[1]]
 
 

@@ -50,7 +50,7 @@ SEES = {
     "full": "colours depend on the direction of view",
 }
 POSES = ("source", "registered", "total", "models", "missing", "seconds", "agreement")
-OPENED = {".html", ".ply", ".obj", ".glb", ".mp4", ".txt", ".json"}
+OPENED = {".html", ".ply", ".obj", ".glb", ".usdz", ".las", ".laz", ".e57", ".mp4", ".txt", ".json"}
 NO_TEST_VIEWS = "no image was held out, so there are no scores; give --holdout 8 to keep every 8th image for testing"
 
 

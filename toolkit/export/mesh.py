@@ -68,10 +68,8 @@ def write_textured(path: Path | str, mesh: Mesh, atlas: Atlas, texture: Array, w
     if working_from_input is not None:
         mesh = mesh.transformed(working_from_input.inverse())
     offset = np.zeros(3) if single_precision(mesh.vertices) else mesh.bounds().mean(axis=0)
-    packed = io.BytesIO()
-    # Neighbouring triangles of the texture need not be neighbours in space, so colours are kept for each texel, not for four of them.
-    Image.fromarray(texture).save(packed, format="JPEG", quality=JPEG_QUALITY, subsampling=0)
-    material = PBRMaterial(baseColorTexture=Image.open(packed), metallicFactor=0.0, roughnessFactor=1.0)
+    packed = packed_texture(texture)
+    material = PBRMaterial(baseColorTexture=Image.open(io.BytesIO(packed)), metallicFactor=0.0, roughnessFactor=1.0)
     visual = TextureVisuals(uv=atlas.coordinates().reshape(-1, 2), material=material)
     # Each triangle has a place of its own in the texture, so it has vertices of its own.
     vertices = (mesh.vertices - offset)[mesh.triangles].reshape(-1, 3)
@@ -80,12 +78,19 @@ def write_textured(path: Path | str, mesh: Mesh, atlas: Atlas, texture: Array, w
 
     def put_picture(buffers: dict[Any, bytes], tree: dict[str, Any]) -> None:
         """In place of what trimesh makes of the image, which it packs again, worse."""
-        data = packed.getvalue()
-        buffers[list(buffers)[tree["images"][0]["bufferView"]]] = data + bytes(-len(data) % 4)
+        buffers[list(buffers)[tree["images"][0]["bufferView"]]] = packed + bytes(-len(packed) % 4)
 
     data = _as_glb(solid, offset, include_normals=False, buffer_postprocessor=put_picture, tree_postprocessor=_unlit)
     with atomic_path(path) as temporary:
         temporary.write_bytes(data)
+
+
+def packed_texture(texture: Array) -> bytes:
+    """(S, S, 3) uint8 as JPEG."""
+    packed = io.BytesIO()
+    # Neighbouring triangles of the texture need not be neighbours in space, so colours are kept for each texel, not for four of them.
+    Image.fromarray(texture).save(packed, format="JPEG", quality=JPEG_QUALITY, subsampling=0)
+    return packed.getvalue()
 
 
 def _unlit(tree: dict[str, Any]) -> None:
