@@ -18,6 +18,9 @@ def export(
     formats: Annotated[
         str | None, typer.Option(help=f"Comma-separated part of {','.join(EXPORTS)}.", show_default=False)
     ] = None,
+    undistorted: Annotated[
+        bool, typer.Option("--undistorted", help="Pinhole images with cameras for nerfstudio, COLMAP and 3DGS, with --formats or alone.")
+    ] = False,
     *,
     options: Options,
 ) -> None:
@@ -29,4 +32,6 @@ def export(
     if wanted == []:
         raise InputError(f"--formats names none; give some of {', '.join(EXPORTS)}, separated by commas")
     require_formats(wanted or [], "--formats")
+    if undistorted:
+        wanted = [*(wanted or []), "undistorted"]
     work(place, options, ("export",), options.settings(), formats=wanted)

@@ -14,11 +14,13 @@ from fieldfuse import memory
 from fieldfuse.camera import Array
 from fieldfuse.capture.convert import all_converted, stored_cameras
 from fieldfuse.capture.select import SELECTED
-from fieldfuse.capture.types import Capture
+from fieldfuse.capture.types import MODEL_NAMES, Capture
 from fieldfuse.errors import InputError
 from fieldfuse.export.cameras import write_cameras
 from fieldfuse.export.extras import require
+from fieldfuse.export.sparse import colours_in, points_of_field, stored_points
 from fieldfuse.export.surface import Originals, at_most, surface_of_field, whole_mesh
+from fieldfuse.export.undistorted import write_undistorted
 from fieldfuse.files import write_json
 from fieldfuse.memory import require_pictures
 from fieldfuse.pipelines.fields import Fitted
@@ -29,7 +31,6 @@ from fieldfuse.pipelines.schemas import read_export_facts
 from fieldfuse.pipelines.stages import CollectingStage
 from fieldfuse.pipelines.surfaces import in_input, put_cloud, put_points
 from fieldfuse.pipelines.textured import TEXTURED, put_textured
-from fieldfuse.poses.result import PoseResult
 from fieldfuse.tone import exposed
 
 MESHES = ("ply", "obj", "glb")  # as `export.formats` has them
@@ -37,8 +38,8 @@ TEXTURE = "texture"
 TEXTURES = {TEXTURE: TEXTURED, "usdz": "textured.usdz"}
 CLOUDS = ("las", "laz", "e57")
 SURFACES = {"points", *CLOUDS, *MESHES, *TEXTURES}
+UNDISTORTED = "undistorted"
 MOST_TRIANGLES = 2_000_000
-MOST_SPARSE = 20_000  # points that go with exported cameras
 VIDEO_SIDE = 640
 FPS = 30
 REMOVED = "of an earlier field, and removed: {}; `fieldfuse export {} --formats …` exports this one"
@@ -148,9 +149,17 @@ def export_field(job: Job, ready: Prepared, fitted: Fitted, wish: Wish) -> Expor
         except InputError as error:
             undone |= surfaces
             notes.append(f"points and meshes were left out: {error}")
-    if "cameras" in formats:
-        put_cameras(folder / "cameras", ready.poses, ready.posed, *sparse_points(folder / "points.ply"))
-        out.files += [path for path in sorted((folder / "cameras").rglob("*")) if path.is_file()]
+    if wanted := (formats - undone) & {"cameras", UNDISTORTED}:
+        sparse = starting_points(job, ready, fitted)
+        if "cameras" in wanted:
+            put_cameras(folder / "cameras", ready.posed, *sparse)
+            out.files += [path for path in sorted((folder / "cameras").rglob("*")) if path.is_file()]
+        if UNDISTORTED in wanted:
+            try:
+                out.files += write_undistorted(folder / UNDISTORTED, ready.posed, *sparse, views.test, job.progress)
+            except InputError as error:
+                undone, out.whole = undone | {UNDISTORTED}, False
+                notes.append(f"undistorted images were left out: {error}")
     if PAGE in formats:
         try:
             out.files.append(put_page(job, folder / NAME, fitted.field, views, scene))
@@ -214,12 +223,11 @@ def export_surface(
     return facts, written
 
 
-def put_cameras(folder: Path, poses: PoseResult, posed: Capture, points: Array | None = None, colours: Array | None = None) -> None:
+def put_cameras(folder: Path, posed: Capture, points: Array | None = None, colours: Array | None = None) -> None:
     """Cameras as transforms.json and COLMAP text, to be put into the capture's folder: for the images as they lie there.
 
     Args:
-        points, colours: (P, 3) of a surface in the input's frame, for poses that came without points: programs that start from points
-            need some.
+        points, colours: (P, 3) in the input's frame, and their colours (None: grey).
     """
     made_here = SELECTED in posed.extra or all_converted(posed)  # then the images lie in the run's folder
     root = posed.frames[0].image.parent.parent if made_here else posed.root
@@ -227,22 +235,23 @@ def put_cameras(folder: Path, poses: PoseResult, posed: Capture, points: Array |
     bases = (root, root.resolve())
     paths = [frame.image for frame in posed.frames]
     files = [next((path.relative_to(base).as_posix() for base in bases if path.is_relative_to(base)), str(path)) for path in paths]
+    known = {} if made_here else posed.extra.get(MODEL_NAMES, {})
+    names = [known.get(frame.name, file) for frame, file in zip(posed.frames, files, strict=True)]
     # Those of the frames that take part, which may be fewer than have a pose.
     intrinsics, world_from_camera = stored_cameras(posed)
-    if poses.points is not None and len(poses.points):
-        points, colours = poses.points, None
-    write_cameras(folder, files, intrinsics, world_from_camera, points, colours)
+    write_cameras(folder, files, intrinsics, world_from_camera, points, colours, names)
 
 
-def sparse_points(path: Path) -> tuple[Array, Array] | tuple[None, None]:
-    """At most `MOST_SPARSE` points (P, 3) of an exported cloud, evenly chosen, and their colours (P, 3) uint8; None where there is none."""
-    import trimesh
-
-    if not path.is_file():
-        return None, None
-    cloud: Any = trimesh.load(path, process=False)
-    chosen = np.linspace(0, len(cloud.vertices) - 1, min(MOST_SPARSE, len(cloud.vertices))).astype(int)
-    return np.asarray(cloud.vertices)[chosen], np.asarray(cloud.colors)[chosen, :3]
+def starting_points(job: Job, ready: Prepared, fitted: Fitted) -> tuple[Array, Array]:
+    """(P, 3) points in the input's frame, and their colours (P, 3) uint8, for programs that start from some: those that came with the
+    poses, else of the surface that was exported, else of renders of the field."""
+    views, working, points = ready.training, ready.scene.working_from_input, ready.poses.points
+    if points is not None and len(points):
+        return points, exposed(colours_in(working.points(points), views), views.exposure)
+    if (stored := stored_points(job.folder / "exports" / "points.ply")) is not None and len(stored[0]):
+        return stored
+    points, colours = points_of_field(fitted.field, views, job.settings.engine)
+    return working.inverse().points(points), exposed(colours, views.exposure)
 
 
 def needs_originals(job: Job, formats: Iterable[str]) -> list[tuple[str, set[str], int]]:

@@ -346,8 +346,8 @@ class TsdfSettings:
 # Files for other programs: "texture" is a mesh with one (textured.glb), "page" the field itself for any browser (field.html), the others
 # are named as they end, or as what they hold.
 DEFAULT_EXPORTS = ("points", "ply", "obj", "glb", "texture", "page", "cameras", "video")
-# Made when they are named, since they need an extra: points as LAS, LAZ or E57, the textured mesh as USDZ.
-MORE_EXPORTS: tuple[str, ...] = ("las", "laz", "e57", "usdz")
+# Made when they are named: points as LAS, LAZ or E57, the textured mesh as USDZ (these need extras), pinhole images with cameras.
+MORE_EXPORTS: tuple[str, ...] = ("las", "laz", "e57", "usdz", "undistorted")
 EXPORTS: tuple[str, ...] = (*DEFAULT_EXPORTS, *MORE_EXPORTS)
 
 

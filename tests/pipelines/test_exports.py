@@ -164,3 +164,18 @@ def test_what_could_not_be_made_without_the_capture_is_made_when_it_is_back(out:
     away.rename(room)
     assert call(capsys, "export", out, *AGAIN).code == 0
     assert files(out) >= {"cameras", "mesh.glb"}
+
+
+def test_cameras_come_with_points_and_pinhole_images_with_both(out: Path, capsys: Capsys) -> None:
+    (out / "exports" / "points.ply").unlink()
+    answer = call(capsys, "export", out, "--formats", "cameras", "--undistorted", *AGAIN)
+    assert answer.code == 0 and files(out) == {"cameras", "undistorted"}, answer.err
+    folder = out / "exports" / "undistorted"
+    for lines in ((out / "exports" / "cameras" / "colmap" / "points3D.txt"), folder / "sparse" / "0" / "points3D.txt"):
+        assert len(lines.read_text().splitlines()) > 50
+    data = read_json(folder / "transforms.json")
+    assert {entry["file_path"] for entry in data["frames"]} == {f"images/{path.name}" for path in (folder / "images").iterdir()}
+    assert len(data["frames"]) == 10 and len(data["test_filenames"]) == 2
+    shutil.rmtree(out.parent / "room")
+    answer = call(capsys, "export", out, "--undistorted", *AGAIN)
+    assert answer.code == 2 and "undistorted images were left out" in answer.sentence()
