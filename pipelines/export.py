@@ -11,6 +11,8 @@ from fieldfuse.errors import InputError
 from fieldfuse.pipelines.options import Options, Place, takes
 from fieldfuse.pipelines.work import work
 
+CROP = "off, auto, box, hull, or a box x0,y0,z0,x1,y1,z1 in the input's frame; kept for later exports of this run."
+
 
 @takes("threads config pairs quiet json")
 def export(
@@ -21,6 +23,10 @@ def export(
     undistorted: Annotated[
         bool, typer.Option("--undistorted", help="Pinhole images with cameras for nerfstudio, COLMAP and 3DGS, with --formats or alone.")
     ] = False,
+    crop: Annotated[str | None, typer.Option(help=CROP, show_default=False)] = None,
+    clean: Annotated[
+        bool | None, typer.Option("--clean/--no-clean", help="Without parts that no two cameras see (floaters).", show_default=False)
+    ] = None,
     *,
     options: Options,
 ) -> None:
@@ -34,4 +40,4 @@ def export(
     require_formats(wanted or [], "--formats")
     if undistorted:
         wanted = [*(wanted or []), "undistorted"]
-    work(place, options, ("export",), options.settings(), formats=wanted)
+    work(place, options, ("export",), options.settings(**{"export.crop": crop, "export.clean": clean}), formats=wanted)

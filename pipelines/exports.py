@@ -17,6 +17,7 @@ from fieldfuse.capture.select import SELECTED
 from fieldfuse.capture.types import MODEL_NAMES, Capture
 from fieldfuse.errors import InputError
 from fieldfuse.export.cameras import write_cameras
+from fieldfuse.export.crop import LEAST_INSIDE, LEAST_KEPT, Region, cleaned, cropped, kept_share, region_of
 from fieldfuse.export.extras import require
 from fieldfuse.export.sparse import colours_in, points_of_field, stored_points
 from fieldfuse.export.surface import Originals, at_most, surface_of_field, whole_mesh
@@ -42,7 +43,7 @@ UNDISTORTED = "undistorted"
 MOST_TRIANGLES = 2_000_000
 VIDEO_SIDE = 640
 FPS = 30
-REMOVED = "of an earlier field, and removed: {}; `fieldfuse export {} --formats …` exports this one"
+REMOVED = "of an earlier field or another crop, and removed: {}; `fieldfuse export {} --formats …` exports this one"
 GONE = (
     "the folder of the capture, {}, is not there any more, and its pictures are needed; put it back (or repeat the run's own command with "
     "its new place) and run the command again"
@@ -87,13 +88,15 @@ def export_results(job: Job, ready: Prepared, fitted: Fitted, wish: Wish) -> dic
     """
     path = job.folder / "exports" / "facts.json"
     old, exported = job.stages.record("export"), Exported({})
+    part = job.settings.export.crop + (", cleaned" if job.settings.export.clean else "")
+    same_part = not path.is_file() or read_export_facts(path)["part"] == part
 
     def make() -> dict[str, Any]:
         nonlocal exported
-        fits = job.stages.usable("export")
+        fits = job.stages.usable("export") and same_part
         before = read_export_facts(path) if fits else None
         exported = export_field(job, ready, fitted, wish)
-        stage.whole, facts = exported.whole, exported.facts
+        stage.whole, facts = exported.whole, {**exported.facts, "part": part}
         if wish.alone and not exported.made:
             raise InputError(f"nothing was exported: {'; '.join(facts['notes'])}")
         if before is not None and facts["mesh"] is None:
@@ -117,6 +120,7 @@ def export_results(job: Job, ready: Prepared, fitted: Fitted, wish: Wish) -> dic
         settings=asdict(job.settings.export),
         version=3,
         only_part=wish.formats is not None,
+        renewed=not same_part,
     )
     return job.run(stage)
 
@@ -130,6 +134,7 @@ def export_field(job: Job, ready: Prepared, fitted: Fitted, wish: Wish) -> Expor
     notes: list[str] = []
     out = Exported({"mesh": None, "notes": notes})
     undone: set[str] = set()
+    fitted, region = shown_part(job, ready, fitted, notes, wish.alone)
     for name in sorted(formats):
         try:
             require(name)
@@ -144,7 +149,7 @@ def export_field(job: Job, ready: Prepared, fitted: Fitted, wish: Wish) -> Expor
     out.whole = not undone
     if surfaces := (formats - undone) & SURFACES:
         try:
-            out.facts["mesh"], out.files = export_surface(job, ready, fitted, surfaces, notes)
+            out.facts["mesh"], out.files = export_surface(job, ready, (fitted, region), surfaces, notes)
             undone |= {name for name, file in TEXTURES.items() if folder / file not in out.files}
         except InputError as error:
             undone |= surfaces
@@ -178,8 +183,43 @@ def export_field(job: Job, ready: Prepared, fitted: Fitted, wish: Wish) -> Expor
     return out
 
 
+def shown_part(job: Job, ready: Prepared, fitted: Fitted, notes: list[str], strict: bool) -> tuple[Fitted, Region | None]:
+    """The field as `export.crop` and `export.clean` have it exported, and the region (working frame), if it was cropped; `notes` gets what
+    was done, or why it was not.
+
+    Raises:
+        InputError: with `strict`, a crop that is not possible.
+    """
+    settings, views, whole = job.settings.export, ready.training, fitted.field
+    if settings.clean:
+        part = cleaned(whole, views.intrinsics, views.world_from_camera, job.progress)
+        notes.append(f"floaters: {whole.voxels - part.voxels} of {whole.voxels} voxels were left out of exports")
+        whole = part
+    if settings.crop == "off":
+        return replace(fitted, field=whole), None
+    try:
+        region = region_of(settings.crop, ready.scene, views)
+        if region is None:
+            notes.append("export.crop=auto cropped nothing, since the cameras do not look at one object")
+            return replace(fitted, field=whole), None
+        part = cropped(whole, region)
+        kept, inside = kept_share(whole, part, region, views)
+        if part.voxels == 0:
+            raise InputError("nothing of the field lies in the region; its numbers are in the frame of the input, as points.ply has it")
+        if settings.crop == "auto" and (kept < LEAST_KEPT or inside < LEAST_INSIDE):
+            raise InputError(f"{100 * kept:.0f}% of what training images show would stay, and {100 * inside:.0f}% of what lies in the box")
+    except InputError as error:
+        if strict and settings.crop != "auto":
+            job.folder.restore()  # the next export does not try it again
+            raise InputError(f"export.crop={settings.crop} is not possible: {error}") from error
+        notes.append(f"nothing was cropped: {error}")
+        return replace(fitted, field=whole), None
+    notes.append(f"exports are cropped ({settings.crop}): they hold {100 * kept:.0f}% of what training images show")
+    return replace(fitted, field=part), region
+
+
 def export_surface(
-    job: Job, ready: Prepared, fitted: Fitted, formats: set[str], notes: list[str]
+    job: Job, ready: Prepared, shown: tuple[Fitted, Region | None], formats: set[str], notes: list[str]
 ) -> tuple[dict[str, Any], list[Path]]:
     """The field's depth at the training cameras, polished by their images as they were taken and fused: points and meshes of the region of
     interest; `notes` gets a sentence when the texture had to be left out.
@@ -190,8 +230,9 @@ def export_surface(
     from fieldfuse.export.mesh import mesh_facts, write_mesh
 
     folder, exposure = job.folder / "exports", ready.views.exposure
+    fitted, region = shown
     originals = Originals(ready.posed, ready.corrections)
-    volume = surface_of_field(fitted.field, ready.views, ready.scene, job.settings, originals, job.progress)
+    volume = surface_of_field(fitted.field, ready.views, ready.scene, job.settings, originals, job.progress, region)
     memory.give_back()  # what images and depth maps took
     input_from_working = ready.scene.working_from_input.inverse()
     written = []
