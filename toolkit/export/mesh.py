@@ -125,20 +125,25 @@ def to_trimesh(mesh: Mesh, offset: Array | None = None) -> trimesh.Trimesh:
 def _write_obj(path: Path, mesh: Mesh) -> None:
     normals = mesh.normals
     # Nine digits hold a float32; a model far from its frame's origin needs all seventeen of a float64.
-    vertex = "v {0} {0} {0} {{:.5g}} {{:.5g}} {{:.5g}}\n".format("{:.9g}" if single_precision(mesh.vertices) else "{:.17g}")
+    vertex = "v {0} {0} {0} %.5g %.5g %.5g\n".format("%.9g" if single_precision(mesh.vertices) else "%.17g")
     with atomic_path(path) as temporary, temporary.open("w", encoding="ascii") as file:
         file.write("# vertices: x y z red green blue (colours 0 to 1)\n")
         for start in range(0, len(mesh.vertices), ROWS_AT_ONCE):
             part = slice(start, start + ROWS_AT_ONCE)
             rows = np.concatenate([mesh.vertices[part], mesh.colours[part] / 255], axis=1)
-            file.writelines(vertex.format(*row) for row in rows.tolist())
+            file.write(_lines(vertex, rows))
             if normals is not None:
-                file.writelines("vn {:.5g} {:.5g} {:.5g}\n".format(*row) for row in normals[part].tolist())
-        template = "f {}//{} {}//{} {}//{}\n" if normals is not None else "f {} {} {}\n"
+                file.write(_lines("vn %.5g %.5g %.5g\n", normals[part]))
+        template = "f %d//%d %d//%d %d//%d\n" if normals is not None else "f %d %d %d\n"
         for start in range(0, len(mesh.triangles), ROWS_AT_ONCE):
             corners = mesh.triangles[start : start + ROWS_AT_ONCE] + 1
             rows = np.repeat(corners, 2, axis=1) if normals is not None else corners
-            file.writelines(template.format(*row) for row in rows.tolist())
+            file.write(_lines(template, rows))
+
+
+def _lines(template: str, rows: Array) -> str:
+    """Each row of numbers as a line: all at once takes half the time."""
+    return (template * len(rows)) % tuple(rows.reshape(-1).tolist())
 
 
 def _write_glb(path: Path, mesh: Mesh) -> None:
