@@ -17,7 +17,7 @@ from fieldfuse.capture.select import SELECTED
 from fieldfuse.capture.types import MODEL_NAMES, Capture
 from fieldfuse.errors import InputError
 from fieldfuse.export.cameras import write_cameras
-from fieldfuse.export.crop import LEAST_INSIDE, LEAST_KEPT, Region, cleaned, cropped, kept_share, region_of
+from fieldfuse.export.crop import LEAST_INSIDE, LEAST_KEPT, cleaned, cropped, kept_share, region_of
 from fieldfuse.export.extras import require
 from fieldfuse.export.sparse import colours_in, points_of_field, stored_points
 from fieldfuse.export.surface import Originals, at_most, surface_of_field, whole_mesh
@@ -32,6 +32,7 @@ from fieldfuse.pipelines.schemas import read_export_facts
 from fieldfuse.pipelines.stages import CollectingStage
 from fieldfuse.pipelines.surfaces import in_input, put_cloud, put_points
 from fieldfuse.pipelines.textured import TEXTURED, put_textured
+from fieldfuse.poses.region import Region
 from fieldfuse.tone import exposed
 
 MESHES = ("ply", "obj", "glb")  # as `export.formats` has them
@@ -219,7 +220,7 @@ def shown_part(job: Job, ready: Prepared, fitted: Fitted, notes: list[str], stri
 
 
 def export_surface(
-    job: Job, ready: Prepared, shown: tuple[Fitted, Region | None], formats: set[str], notes: list[str]
+    job: Job, ready: Prepared, part: tuple[Fitted, Region | None], formats: set[str], notes: list[str]
 ) -> tuple[dict[str, Any], list[Path]]:
     """The field's depth at the training cameras, polished by their images as they were taken and fused: points and meshes of the region of
     interest; `notes` gets a sentence when the texture had to be left out.
@@ -230,7 +231,7 @@ def export_surface(
     from fieldfuse.export.mesh import mesh_facts, write_mesh
 
     folder, exposure = job.folder / "exports", ready.views.exposure
-    fitted, region = shown
+    fitted, region = part
     originals = Originals(ready.posed, ready.corrections)
     volume = surface_of_field(fitted.field, ready.views, ready.scene, job.settings, originals, job.progress, region)
     memory.give_back()  # what images and depth maps took

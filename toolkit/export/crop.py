@@ -53,7 +53,7 @@ def region_of(crop: str, scene: Scene, views: Views) -> Region | None:
         InputError: there is no such region.
     """
     if (corners := crop_box(crop)) is not None:
-        return Region.box(corners[0], corners[1]).moved(scene.working_from_input)
+        return Region.box(np.array(corners[0]), np.array(corners[1])).moved(scene.working_from_input)
     if crop == "off" or (crop == "auto" and scene.layout != OBJECT):
         return None
     return common_view(scene, views) if crop == "hull" else Region.box(*scene.surface_box())
