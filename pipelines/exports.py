@@ -271,8 +271,9 @@ def put_cameras(folder: Path, posed: Capture, points: Array | None = None, colou
     Args:
         points, colours: (P, 3) in the input's frame, and their colours (None: grey).
     """
-    made_here = SELECTED in posed.extra or all_converted(posed)  # then the images lie in the run's folder
-    root = posed.frames[0].image.parent.parent if made_here else posed.root
+    cut = all(frame.instant is not None for frame in posed.frames)
+    made_here = cut or SELECTED in posed.extra or all_converted(posed)  # then the images lie in the run's folder
+    root = posed.frames[0].image.parents[2 if cut else 1] if made_here else posed.root
     # A capture that is reached through a link has its images where the link leads.
     bases = (root, root.resolve())
     paths = [frame.image for frame in posed.frames]

@@ -86,11 +86,13 @@ def source_facts(source: Path, fast: bool, quiet: bool) -> dict[str, Any]:
 
 def check_poses(capture: Capture, progress: Progress) -> tuple[str | None, list[str]]:
     """How well the poses that a capture brings fit its images, in a line, and what a run would warn of or refuse."""
+    from fieldfuse.camera import EQUIRECTANGULAR
     from fieldfuse.errors import PoseError
     from fieldfuse.poses.check_given import Agreement, check_given
     from fieldfuse.poses.result import given_poses
 
-    if capture.filmed or not capture.posed:
+    panoramas = any(frame.intrinsics is not None and frame.intrinsics.lens == EQUIRECTANGULAR for frame in capture.frames)
+    if capture.filmed or not capture.posed or panoramas:
         return None, []
     try:
         result = check_given(capture, given_poses(capture), progress=progress)

@@ -10,9 +10,9 @@ from typing import Any
 import numpy as np
 
 from fieldfuse import steps
-from fieldfuse.capture.film import DEPTH
 from fieldfuse.capture.photos import with_unposed
 from fieldfuse.capture.prepare import limited
+from fieldfuse.capture.sphere import SIDE, to_cut
 from fieldfuse.capture.storage import capture_from_dict, capture_to_dict, load_views, save_views
 from fieldfuse.capture.types import Capture, Frame, Views
 from fieldfuse.effects.correct import Corrections
@@ -74,9 +74,10 @@ def prepare(job: Job, capture: Capture | None = None) -> Prepared:
 def find_capture(job: Job) -> Capture:
     """Detect what the source is, read it, look at every image once (at those that `choose_frames` writes, then)."""
     path = job.folder / "capture.json"
-    masks, light = job.settings.capture.masks, job.settings.capture.light
+    masks, light, projection = job.settings.capture.masks, job.settings.capture.light, job.settings.capture.projection
     state = source_state(job.source, job.folder.path)
-    given = [*([masks] if masks != "auto" else []), *([f"light {light}"] if light != "auto" else [])]
+    given = [masks] if masks != "auto" else []
+    given += [f"{name} {value}" for name, value in (("light", light), ("projection", projection)) if value != "auto"]
     found = job.run(
         Stage(
             "capture",
@@ -101,12 +102,16 @@ def choose_frames(job: Job, capture: Capture) -> Capture:
     folder = job.folder / "frames"
     path = folder / "capture.json"
 
+    depends: Any = job.settings.capture.max_frames if capture.filmed else pixel_state(capture)
+    if to_cut(capture) and (job.settings.capture.image_size or 0) > SIDE:
+        depends = [depends, job.settings.capture.image_size]
+
     def make() -> Capture:
         steps.set_seeds(job.settings.seed)
         return steps.write_frames(capture, job.folder.path, job.settings, job.progress)
 
     def save(chosen: Capture) -> list[Path]:
-        files = [file for frame in chosen.frames for file in (frame.image, frame.depth) if file is not None]
+        files = [file for frame in chosen.frames for file in (frame.image, frame.depth, frame.mask) if file is not None]
         return [*(file for file in files if file.is_relative_to(folder.resolve())), _written(path, capture_to_dict(chosen))]
 
     return job.run(
@@ -116,7 +121,7 @@ def choose_frames(job: Job, capture: Capture) -> Capture:
             save=save,
             load=lambda: in_folder(capture_from_dict(read_json(path)), folder),
             inputs=["capture"],
-            settings=job.settings.capture.max_frames if capture.filmed else pixel_state(capture),
+            settings=depends,
         )
     )
 
@@ -124,12 +129,14 @@ def choose_frames(job: Job, capture: Capture) -> Capture:
 def in_folder(chosen: Capture, folder: Path) -> Capture:
     """The capture with what was written to a run's `frames` where that is now: the run's folder may have been moved."""
     def here(frame: Frame) -> Frame:
-        if not (frame.image.parent.name == folder.name and (folder / frame.image.name).is_file()):
+        before = frame.image.parent.parent if frame.instant else frame.image.parent  # the run's `frames`, where that was
+        if before.name != folder.name or not (folder / frame.image.relative_to(before)).is_file():
             return frame
-        depth = frame.depth
-        if depth is not None and depth.parent == frame.image.parent / DEPTH:
-            depth = folder / DEPTH / depth.name
-        return replace(frame, image=folder / frame.image.name, depth=depth)
+
+        def moved(path: Path | None) -> Path | None:
+            return folder / path.relative_to(before) if path is not None and path.is_relative_to(before) else path
+
+        return replace(frame, image=folder / frame.image.relative_to(before), depth=moved(frame.depth), mask=moved(frame.mask))
 
     return chosen.with_frames([here(frame) for frame in chosen.frames])
 

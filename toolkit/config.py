@@ -244,6 +244,9 @@ class CaptureSettings:
     max_frames: Positive = 150  # frames taken from a video
     # auto: black is left out | inverted: white is | off: masks beside the images are not used
     masks: Annotated[str, one_of("auto", "inverted", "off")] = "auto"
+    # auto: 360° panoramas are recognised, and these and fisheye images are cut into views | perspective: neither | equirectangular: all are
+    # panoramas
+    projection: Annotated[str, one_of("auto", "perspective", "equirectangular")] = "auto"
     # What floating-point pictures hold. auto: by format, profile and values | linear: light | display: values for screens (sRGB)
     light: Annotated[str, one_of("auto", "linear", "display")] = "auto"
 

@@ -105,27 +105,33 @@ def read_capture(source: Path, settings: Settings, progress: Progress = SILENT) 
     from fieldfuse.capture.light import LIGHT
     from fieldfuse.poses.check_given import best_fitting
 
-    capture = open_capture(source, settings.capture.masks, best_fitting)
+    capture = open_capture(source, settings.capture.masks, best_fitting, settings.capture.projection)
     if settings.capture.light != "auto":
         capture = replace(capture, extra={**capture.extra, LIGHT: settings.capture.light})
     return capture if to_convert(capture) else check_capture(capture, progress)
 
 
 def needs_frames(capture: Capture) -> bool:
-    """Whether images have to be written before they can be used: those of a video or film, HEIF, mirrored ones."""
+    """Whether images have to be written before they can be used: those of a video or film, HEIF, mirrored ones, views of panoramas and
+    fisheye images."""
     from fieldfuse.capture.convert import to_convert
+    from fieldfuse.capture.sphere import to_cut
 
-    return capture.filmed or bool(to_convert(capture))
+    return capture.filmed or bool(to_convert(capture)) or bool(to_cut(capture))
 
 
 def write_frames(capture: Capture, folder: Path, settings: Settings, progress: Progress = SILENT) -> Capture:
-    """The capture with images in `folder/frames`: chosen from a video or film, or converted from HEIF and mirrored ones."""
-    from fieldfuse.capture.convert import convert_images
+    """The capture with images in `folder/frames`: chosen from a video or film, converted from HEIF and mirrored ones, or cut into views."""
+    from fieldfuse.capture.convert import convert_images, to_convert
     from fieldfuse.capture.select import select_frames
+    from fieldfuse.capture.sphere import SIDE, cut_images, to_cut
 
+    threads = settings.threads or os.cpu_count() or 1
     if capture.filmed:
-        return select_frames(capture, folder, settings.capture, progress)
-    return convert_images(capture, folder, settings.threads or os.cpu_count() or 1, progress)
+        capture = select_frames(capture, folder, settings.capture, progress)
+    if to_convert(capture):
+        capture = convert_images(capture, folder, threads, progress)
+    return cut_images(capture, folder, threads, progress, max(SIDE, settings.capture.image_size or 0)) if to_cut(capture) else capture
 
 
 def uses_given_poses(capture: Capture, settings: Settings) -> bool:

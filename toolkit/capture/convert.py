@@ -70,7 +70,7 @@ def convert_images(capture: Capture, out: Path, threads: int, progress: Progress
     capture = with_white(capture, progress)
     folder = Path(out) / "frames"
     names = unique_names([capture.frames[i].image for i in indices])
-    done = _still_good(folder, {name: _state(capture.frames[i]) for name, i in zip(names, indices, strict=True)})
+    done = still_good(folder, {name: _state(capture.frames[i]) for name, i in zip(names, indices, strict=True)})
     finished = 0
 
     def convert(one: tuple[str, int]) -> tuple[int, Path]:
@@ -97,8 +97,12 @@ def _state(frame: Frame) -> str:
 
 
 def write_image(frame: Frame, target: Path) -> Path:
-    """Write a frame's image, upright, as `target` with `.jpg` added, or `.png` where it has alpha, and return that path."""
-    source, image = frame.image, upright(*read_image(frame))
+    """Write a frame's image, upright, as `save_image` does, and return its path."""
+    return save_image(upright(*read_image(frame)), target, frame.image)
+
+
+def save_image(image: Array, target: Path, source: Path) -> Path:
+    """Write (H, W, 3 or 4) uint8, made of the file `source`, as `target` with `.jpg` added, or `.png` where it has alpha; its path."""
     alpha = image.shape[2] == 4
     path = target.with_name(f"{target.name}.{'png' if alpha else 'jpg'}")
     order = cv2.COLOR_RGBA2BGRA if alpha else cv2.COLOR_RGB2BGR
@@ -110,7 +114,7 @@ def write_image(frame: Frame, target: Path) -> Path:
     return path
 
 
-def _still_good(folder: Path, wanted: dict[str, str]) -> dict[str, Path]:
+def still_good(folder: Path, wanted: dict[str, str]) -> dict[str, Path]:
     """Of the images wanted (name → state of its source) those that an earlier attempt left there; what it left of other sources is
     removed, and what is wanted is noted down."""
     marker = folder / MARKER

@@ -11,7 +11,7 @@ import cv2
 import numpy as np
 from safetensors.numpy import save
 
-from fieldfuse.camera import Array, Intrinsics, opengl_from_world
+from fieldfuse.camera import EQUIRECTANGULAR, FISHEYE, Array, Intrinsics, opengl_from_world
 from fieldfuse.effects.effect_specs import Effects, parse
 from fieldfuse.errors import InputError, OutputError
 from fieldfuse.files import atomic_path, write_json
@@ -21,13 +21,15 @@ from fieldfuse.simulate.film import Film, FilmCamera, Shot, drawing
 from fieldfuse.simulate.mesh_scene import SUFFIXES, load_mesh_scene
 from fieldfuse.simulate.paths import plan
 from fieldfuse.simulate.procedural import random_scene
-from fieldfuse.simulate.settings import SceneFile
+from fieldfuse.simulate.settings import PANORAMA, PINHOLE, SceneFile
 from fieldfuse.simulate.solids import Mesh
 
 SCENE, PATH = 0, 1  # streams of random numbers
 TRUTH = "ground_truth"
 DEPTH_STEPS = 1000.0  # stored depth values a metre
 MOST_STEPS = 65535
+LENS_EFFECTS = ("distortion", "vignetting")
+MODELS = ("PINHOLE", "OPENCV")
 
 
 def open_scene(settings: SceneFile, beside: Path) -> Scenery:
@@ -55,8 +57,13 @@ def prepare(settings: SceneFile, beside: Path, effects: Effects) -> Film:
     for name in ("depth_noise", "depth_offset"):
         if getattr(effects, name) is not None and not settings.depth:
             raise InputError(f"{name} is listed, but the capture has no depth; set `depth: true` in the scene file")
+    if settings.camera.kind != PINHOLE and (wrong := [name for name in LENS_EFFECTS if getattr(effects, name) is not None]):
+        kind = f"camera.kind: {settings.camera.kind}"
+        raise InputError(f"{wrong[0]} is listed, which is modelled for a pinhole camera only; leave it out with {kind}")
     scene = open_scene(settings, beside)
     motion = plan(scene, settings.path, np.random.default_rng([settings.seed, PATH]))
+    if settings.camera.kind == PANORAMA:  # such cameras stand upright, or their software turns what they filmed so
+        motion = replace(motion, curve=replace(motion.curve, forward=motion.curve.forward * [1.0, 1.0, 0.0]))
     if effects.background is not None:
         effects = replace(effects, background=replace(effects.background, seed=effects.background.seed + settings.seed))
     camera = FilmCamera(settings.camera.intrinsics(), settings.side, settings.depth)
@@ -160,7 +167,7 @@ class CaptureWriter:
             size = {"w": lens.width, "h": lens.height, "fl_x": lens.fx, "fl_y": lens.fy, "cx": lens.cx, "cy": lens.cy}
             bent = dict(zip(("k1", "k2", "p1", "p2", "k3"), lens.distortion, strict=False))
             scale = {"integer_depth_scale": 1 / DEPTH_STEPS} if any("depth_file_path" in entry for entry in self.entries) else {}
-            model = {"camera_model": "OPENCV" if lens.distorted else "PINHOLE"}
+            model = {"camera_model": {FISHEYE: "OPENCV_FISHEYE", EQUIRECTANGULAR: "EQUIRECTANGULAR"}.get(lens.lens, MODELS[lens.distorted])}
             write_json(self.folder / "transforms.json", {**model, **size, **bent, **scale, "frames": self.entries})
         write_json(truth / "cameras.json", {"intrinsics": lens.to_dict(), "frames": self.poses})
         write_json(truth / "effects.json", {"effects": effects, "frames": self.facts})

@@ -6,18 +6,21 @@ import json
 import shutil
 from collections.abc import Callable
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 
 import cv2
 import numpy as np
 import torch
+from PIL import Image
 
-from fieldfuse.camera import Intrinsics, Similarity
+from fieldfuse.camera import Intrinsics, Similarity, opengl_from_world
 from fieldfuse.capture import open_capture
 from fieldfuse.capture.checks import check_capture
 from fieldfuse.capture.images import load_image, load_mask
 from fieldfuse.capture.ply_points import read_ply_points
 from fieldfuse.capture.prepare import prepare_views
+from fieldfuse.capture.sphere import cut_view, to_cut, views_of
 from fieldfuse.capture.storage import capture_from_dict, capture_to_dict, load_views, save_views
 from fieldfuse.capture.types import Capture, Views
 from fieldfuse.capture.video import iterate_video, read_video
@@ -30,6 +33,7 @@ from fieldfuse.tone import Tone
 from tests.capture.dng import mosaic, write_dng
 from tests.capture.layouts import LAYOUTS, write_record3d, zipped
 from tests.capture.made import eyes, render, save_picture
+from tests.capture.spheres import room, walk
 from tests.stability.fuzz.given import (
     DATASETS,
     MESHES,
@@ -130,6 +134,31 @@ def make_extras(root: Path) -> None:
     (root / "points.ply").write_text(header + "0 0 0\n1 0.5 2\n-1 3 1e-3\n")
     data.update(ply_file_path="points.ply", depth_unit_scale_factor=1.0, train_filenames=["images/0001.png"], applied_scale=1.0)
     (root / "transforms.json").write_text(json.dumps(data))
+
+
+def make_panoramas(root: Path) -> None:
+    """Posed panoramas, photos of panoramas with Google's XMP in a folder beside, and fisheye images."""
+    xmp = b'<x:xmpmeta xmlns:x="adobe:ns:meta/"><GPano:ProjectionType>equirectangular</GPano:ProjectionType></x:xmpmeta>'
+    for name, model in (("posed", "EQUIRECTANGULAR"), ("photos", ""), ("fisheye", "OPENCV_FISHEYE")):
+        (root / name).mkdir(parents=True)
+        frames = []
+        for number, pose in enumerate(walk(4)):
+            frames.append({"file_path": f"{number}.jpg", "transform_matrix": opengl_from_world(pose).tolist()})
+            Image.fromarray(room(Intrinsics.equirectangular(64, 32), pose)[0]).save(root / name / f"{number}.jpg", xmp=xmp)
+        lens = {"fl_x": 20.0, "fl_y": 20.0, "k1": 0.01, "k2": -0.002} if model == "OPENCV_FISHEYE" else {}
+        if model:
+            (root / name / "transforms.json").write_text(json.dumps({"camera_model": model, **lens, "frames": frames}))
+
+
+def read_panoramas(root: Path, number: int) -> None:
+    def read(folder: Path) -> None:
+        capture = check_capture(contained(open_capture(folder), folder))
+        for index in to_cut(capture):
+            frame = capture.frames[index]
+            for view in views_of(frame.intrinsics)[0]:
+                cut_view(load_image(frame), frame.intrinsics, view)
+
+    all_of(*(partial(read, root / name) for name in ("posed", "photos", "fisheye")))
 
 
 LAYOUTS_CAMERA = LAYOUTS["transforms"][1].__globals__["OFF_CENTRE"]
@@ -282,6 +311,7 @@ TRAINING_FILES = (
     "shard.safetensors", "checkpoint-0000007.safetensors", "train.yaml", "depths.safetensors", "left_out.safetensors",
     "fieldfuse/speed.json",
 )  # fmt: skip
+PANORAMAS = ("posed/transforms.json", "posed/1.jpg", "photos/1.jpg", "fisheye/transforms.json", "fisheye/transforms.json")
 TARGETS: tuple[Target, ...] = (
     *(Target(layout, files, LAYOUTS[layout][1], read_capture, 1.0) for layout, files in FILES.items()),
     Target("recording", ("a.r3d",), make_recording, read_capture, 1.0),
@@ -289,6 +319,7 @@ TARGETS: tuple[Target, ...] = (
     Target("photos", PHOTOS, make_photos, read_photo_folder, 3.0),
     Target("openexr", ("a.exr", "b.exr", "c.exr"), make_exr, read_photo_folder, 1.0),
     Target("camera raw", ("a.dng", "b.dng", "c.dng"), make_raw, read_photo_folder, 1.0),
+    Target("panoramas", PANORAMAS, make_panoramas, read_panoramas, 1.0),
     Target("videos", ("a.avi", "b.mp4", "c.webm"), make_videos, read_one_video, 1.5),
     Target("run json", RUN_FILES, make_runs, read_json_files, 2.0),
     Target("results", RESULT_FILES, make_results, read_results, 2.5),
