@@ -44,7 +44,7 @@ UNDISTORTED = "undistorted"
 MOST_TRIANGLES = 2_000_000
 VIDEO_SIDE = 640
 FPS = 30
-REMOVED = "of an earlier field or another crop, and removed: {}; `fieldfuse export {} --formats …` exports this one"
+REMOVED = "of {}, and removed: {}; `fieldfuse export {} --formats …` exports this one"
 GONE = (
     "the folder of the capture, {}, is not there any more, and its pictures are needed; put it back (or repeat the run's own command with "
     "its new place) and run the command again"
@@ -105,7 +105,8 @@ def export_results(job: Job, ready: Prepared, fitted: Fitted, wish: Wish) -> dic
         if old is not None and not fits:
             made = {file.relative_to(job.folder.path).as_posix() for file in exported.files}
             gone = sorted({Path(name).name for name in set(old.outputs) - made if name.startswith("exports/")} - {path.name})
-            facts["notes"] += [REMOVED.format(", ".join(gone), job.folder.path)] if gone else []
+            of = "an earlier field" if same_part else "another crop"
+            facts["notes"] += [REMOVED.format(of, ", ".join(gone), job.folder.path)] if gone else []
         return facts
 
     def save(facts: dict[str, Any]) -> list[Path]:
