@@ -15,6 +15,7 @@ from fieldfuse.camera import Array
 from fieldfuse.capture.convert import all_converted, stored_cameras
 from fieldfuse.capture.select import SELECTED
 from fieldfuse.capture.types import MODEL_NAMES, Capture
+from fieldfuse.capture.unpack import folder_around
 from fieldfuse.errors import InputError
 from fieldfuse.export.cameras import write_cameras
 from fieldfuse.export.crop import LEAST_INSIDE, LEAST_KEPT, cleaned, cropped, kept_share, region_of
@@ -274,7 +275,7 @@ def put_cameras(folder: Path, posed: Capture, points: Array | None = None, colou
     """
     cut = all(frame.instant is not None for frame in posed.frames)
     made_here = cut or SELECTED in posed.extra or all_converted(posed)  # then the images lie in the run's folder
-    root = posed.frames[0].image.parents[2 if cut else 1] if made_here else posed.root
+    root = posed.frames[0].image.parents[2 if cut else 1] if made_here else folder_around(posed.root) or posed.root
     # A capture that is reached through a link has its images where the link leads.
     bases = (root, root.resolve())
     paths = [frame.image for frame in posed.frames]

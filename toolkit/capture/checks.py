@@ -100,7 +100,8 @@ def check_capture(capture: Capture, progress: Progress = SILENT) -> Capture:
     sizes = Counter(_upright_size(headers[frame.image], turns_by_exif(capture)) for frame in capture.frames)
     warnings = [*_size_warnings(capture, sizes), *_shape_warnings(capture, headers), *_lens_warnings(capture), *copy_warnings]
     warnings += _image_warnings(capture, looks)
-    warnings += check_depth(capture, progress)
+    capture, remarks = check_depth(capture, progress)
+    warnings += remarks
     extra = {**capture.extra, "sizes": {f"{width}x{height}": number for (width, height), number in sizes.most_common()}}
     new = [warning for warning in warnings if warning not in capture.warnings]
     return replace(capture, extra=extra, warnings=(*capture.warnings, *new))

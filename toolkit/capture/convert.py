@@ -32,6 +32,7 @@ from fieldfuse.threads import share
 VERSION = 2  # of what is written
 QUALITY = 97  # of the JPEG files, as of a video's frames
 MOST_AT_ONCE, PIXELS_AT_ONCE = 8, 200e6  # images, and their pixels, on their way at a time: a pixel takes about ten bytes
+RAW_TIMES = 3  # as much memory a pixel takes to be developed
 CONVERTED = "converted"  # in `Capture.extra`: how many images were
 MARKER = "converted.json"  # beside them: what each was made of
 TURNS = {3: (-1, 0), 6: (0, 1), 8: (0, -1)}  # EXIF orientation → cosine and sine of the turn from the upright image to the stored one
@@ -82,7 +83,8 @@ def convert_images(capture: Capture, out: Path, threads: int, progress: Progress
         progress.update(finished, len(indices), f"{finished} of {counted(len(indices), 'image')} as JPEG")
         return index, path.resolve()
 
-    largest = max((math.prod(image_header(capture.frames[i].image).size) for i in indices), default=1)
+    images = [capture.frames[i].image for i in indices]
+    largest = max((math.prod(image_header(image).size) * (RAW_TIMES if is_raw(image) else 1) for image in images), default=1)
     at_once = max(1, min(threads, MOST_AT_ONCE, int(PIXELS_AT_ONCE / largest)))
     written = dict(share(convert, list(zip(names, indices, strict=True)), at_once))
     as_shown: dict[str, Any] = {"white": None, "linear": None, "balance": None}

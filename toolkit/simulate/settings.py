@@ -15,6 +15,7 @@ from fieldfuse.camera import Intrinsics
 from fieldfuse.config import checked, one_of, read_yaml
 from fieldfuse.errors import InputError
 from fieldfuse.simulate.paths import PathSettings
+from fieldfuse.simulate.survey import GpsSettings, MarkerSettings
 
 WIDEST_PINHOLE = 140
 MAX_BYTES = 2**20
@@ -64,6 +65,8 @@ class SceneFile:
     depth: bool = False  # a depth camera beside the colour camera
     side: Annotated[int, Field(ge=1, le=8)] = 2  # pixels that hold an edge are the mean of side × side rays
     mesh: MeshSettings = default(default_factory=MeshSettings)
+    markers: Annotated[list[MarkerSettings], Field(max_length=100)] = default(default_factory=list)  # ArUco markers, in procedural scenes
+    gps: GpsSettings | None = None  # in the images' EXIF; None: they have none
     effects: Any = None
 
 
@@ -100,6 +103,8 @@ def scene_file(data: dict[str, Any], where: str) -> SceneFile:
         raise InputError(f"{where}: the depth camera is a pinhole; leave out `depth: true`, or camera.kind: {kind}")
     if settings.depth and settings.output != "frames":
         raise InputError(f"{where}: depth needs `output: frames`; {settings.output} have nowhere to put it")
+    if settings.gps is not None and settings.output == "video":
+        raise InputError(f"{where}: gps needs `output: frames` or `photos`; a video's frames have no place for it")
     if settings.output == "video" and (settings.camera.width % 2 or settings.camera.height % 2):
         raise InputError(f"{where}: videos need an even width and height; correct camera.width and camera.height")
     return settings

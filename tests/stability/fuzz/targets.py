@@ -23,6 +23,7 @@ from fieldfuse.capture.prepare import prepare_views
 from fieldfuse.capture.sphere import cut_view, to_cut, views_of
 from fieldfuse.capture.storage import capture_from_dict, capture_to_dict, load_views, save_views
 from fieldfuse.capture.types import Capture, Views
+from fieldfuse.capture.unpack import unpacked
 from fieldfuse.capture.video import iterate_video, read_video
 from fieldfuse.config import CaptureSettings, load_settings
 from fieldfuse.files import read_json, write_json
@@ -118,6 +119,19 @@ def make_recording(root: Path) -> None:
     root.mkdir(parents=True, exist_ok=True)
     zipped(source, root / "a.r3d")
     shutil.rmtree(source)
+
+
+def make_zip(root: Path) -> None:
+    source = root.with_name(f"{root.name}-unpacked")
+    LAYOUTS["transforms"][1](source)
+    root.mkdir(parents=True, exist_ok=True)
+    zipped(source, root / "a.zip", "scan/")
+    shutil.rmtree(source)
+
+
+def read_zip(root: Path, number: int) -> None:
+    with unpacked(root / "a.zip") as place:
+        read_capture(place, number)
 
 
 def make_extras(root: Path) -> None:
@@ -265,13 +279,15 @@ def make_runs(root: Path) -> None:
     save_pictures(root / "field.pictures.safetensors", Pictures(["a"], [Picture(pixels, depth)], [0.1], {"x": 1}))
     small_field(1, 0.2).save(root / "field.safetensors")
     small_field(1, 0.2, decoder="per_sample", shell=1.0).save(root / "other.safetensors")
+    frame = {"camera_to_world": np.eye(4).reshape(-1).tolist(), "fov": 50.0}
+    write_json(root / "camera_path.json", {"render_width": 16, "render_height": 12, "fps": 24, "camera_path": [frame] * 2})
     (root / "settings.yaml").write_text("preset: fast\nfit: {budget: 5.0}\nexport:\n  formats: [ply, obj]\ntsdf: {enabled: off}\n")
 
 
 def read_json_files(root: Path, number: int) -> None:
     """Every JSON file of a run's folder, as the commands read it."""
     from fieldfuse.pipelines.folder import RunFolder
-    from fieldfuse.pipelines.render_path import read_cameras
+    from fieldfuse.pipelines.render_path import path_fps, read_cameras
     from fieldfuse.pipelines.stages import finished_stages
     from fieldfuse.poses.result import PoseResult
     from fieldfuse.poses.scene import Scene
@@ -284,6 +300,8 @@ def read_json_files(root: Path, number: int) -> None:
         lambda: PoseResult.from_dict(read_json(root / "poses.json")),
         lambda: Scene.from_dict(read_json(root / "scene.json")),
         lambda: read_cameras(root / "source" / "transforms.json"),
+        lambda: read_cameras(root / "camera_path.json"),
+        lambda: path_fps(root / "camera_path.json"),
         lambda: load_settings("balanced", file=root / "settings.yaml"),
     )
 
@@ -306,7 +324,10 @@ def read_tensors(root: Path, number: int) -> None:
     all_of(lambda: load_views(root / "views.safetensors"), lambda: load_pictures(root / "field.pictures.safetensors"))
 
 
-RUN_FILES = ("run.json", "capture.json", "poses.json", "scene.json", "stages/views.json", "settings.yaml", "source/transforms.json")
+RUN_FILES = (
+    "run.json", "capture.json", "poses.json", "scene.json", "stages/views.json", "settings.yaml", "source/transforms.json",
+    "camera_path.json",
+)  # fmt: skip
 TRAINING_FILES = (
     "shard.safetensors", "checkpoint-0000007.safetensors", "train.yaml", "depths.safetensors", "left_out.safetensors",
     "fieldfuse/speed.json",
@@ -315,6 +336,7 @@ PANORAMAS = ("posed/transforms.json", "posed/1.jpg", "photos/1.jpg", "fisheye/tr
 TARGETS: tuple[Target, ...] = (
     *(Target(layout, files, LAYOUTS[layout][1], read_capture, 1.0) for layout, files in FILES.items()),
     Target("recording", ("a.r3d",), make_recording, read_capture, 1.0),
+    Target("zip file", ("a.zip",), make_zip, read_zip, 1.0),
     Target("extras", ("transforms.json", "mask1.png", "depth2.npy", "points.ply"), make_extras, read_capture, 2.0),
     Target("photos", PHOTOS, make_photos, read_photo_folder, 3.0),
     Target("openexr", ("a.exr", "b.exr", "c.exr"), make_exr, read_photo_folder, 1.0),
