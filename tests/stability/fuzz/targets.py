@@ -265,13 +265,15 @@ def make_runs(root: Path) -> None:
     save_pictures(root / "field.pictures.safetensors", Pictures(["a"], [Picture(pixels, depth)], [0.1], {"x": 1}))
     small_field(1, 0.2).save(root / "field.safetensors")
     small_field(1, 0.2, decoder="per_sample", shell=1.0).save(root / "other.safetensors")
+    frame = {"camera_to_world": np.eye(4).reshape(-1).tolist(), "fov": 50.0}
+    write_json(root / "camera_path.json", {"render_width": 16, "render_height": 12, "fps": 24, "camera_path": [frame] * 2})
     (root / "settings.yaml").write_text("preset: fast\nfit: {budget: 5.0}\nexport:\n  formats: [ply, obj]\ntsdf: {enabled: off}\n")
 
 
 def read_json_files(root: Path, number: int) -> None:
     """Every JSON file of a run's folder, as the commands read it."""
     from fieldfuse.pipelines.folder import RunFolder
-    from fieldfuse.pipelines.render_path import read_cameras
+    from fieldfuse.pipelines.render_path import path_fps, read_cameras
     from fieldfuse.pipelines.stages import finished_stages
     from fieldfuse.poses.result import PoseResult
     from fieldfuse.poses.scene import Scene
@@ -284,6 +286,8 @@ def read_json_files(root: Path, number: int) -> None:
         lambda: PoseResult.from_dict(read_json(root / "poses.json")),
         lambda: Scene.from_dict(read_json(root / "scene.json")),
         lambda: read_cameras(root / "source" / "transforms.json"),
+        lambda: read_cameras(root / "camera_path.json"),
+        lambda: path_fps(root / "camera_path.json"),
         lambda: load_settings("balanced", file=root / "settings.yaml"),
     )
 
@@ -306,7 +310,10 @@ def read_tensors(root: Path, number: int) -> None:
     all_of(lambda: load_views(root / "views.safetensors"), lambda: load_pictures(root / "field.pictures.safetensors"))
 
 
-RUN_FILES = ("run.json", "capture.json", "poses.json", "scene.json", "stages/views.json", "settings.yaml", "source/transforms.json")
+RUN_FILES = (
+    "run.json", "capture.json", "poses.json", "scene.json", "stages/views.json", "settings.yaml", "source/transforms.json",
+    "camera_path.json",
+)  # fmt: skip
 TRAINING_FILES = (
     "shard.safetensors", "checkpoint-0000007.safetensors", "train.yaml", "depths.safetensors", "left_out.safetensors",
     "fieldfuse/speed.json",
