@@ -24,7 +24,6 @@ from fieldfuse.capture.prepare import prepare_views
 from fieldfuse.capture.sphere import cut_view, to_cut, views_of
 from fieldfuse.capture.storage import capture_from_dict, capture_to_dict, load_views, save_views
 from fieldfuse.capture.types import Capture, Views
-from fieldfuse.capture.unpack import unpacked
 from fieldfuse.capture.video import iterate_video, read_video
 from fieldfuse.config import CaptureSettings, load_settings
 from fieldfuse.files import read_json, write_json
@@ -120,19 +119,6 @@ def make_recording(root: Path) -> None:
     root.mkdir(parents=True, exist_ok=True)
     zipped(source, root / "a.r3d")
     shutil.rmtree(source)
-
-
-def make_zip(root: Path) -> None:
-    source = root.with_name(f"{root.name}-unpacked")
-    LAYOUTS["transforms"][1](source)
-    root.mkdir(parents=True, exist_ok=True)
-    zipped(source, root / "a.zip", "scan/")
-    shutil.rmtree(source)
-
-
-def read_zip(root: Path, number: int) -> None:
-    with unpacked(root / "a.zip") as place:
-        read_capture(place, number)
 
 
 def make_extras(root: Path) -> None:
@@ -348,7 +334,6 @@ PANORAMAS = ("posed/transforms.json", "posed/1.jpg", "photos/1.jpg", "fisheye/tr
 TARGETS: tuple[Target, ...] = (
     *(Target(layout, files, LAYOUTS[layout][1], read_capture, 1.0) for layout, files in FILES.items()),
     Target("recording", ("a.r3d",), make_recording, read_capture, 1.0),
-    Target("zip file", ("a.zip",), make_zip, read_zip, 1.0),
     Target("extras", ("transforms.json", "mask1.png", "depth2.npy", "points.ply"), make_extras, read_capture, 2.0),
     Target("photos", PHOTOS, make_photos, read_photo_folder, 3.0),
     Target("openexr", ("a.exr", "b.exr", "c.exr"), make_exr, read_photo_folder, 1.0),
