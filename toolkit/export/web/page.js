@@ -26,7 +26,7 @@ class Page {
     this.photo = about.start;
     this.walker = new Walker(poseOf(about.photos[this.photo].pose), about.depth);
     this.show = 0;
-    this.perPixel = 1e-3;  // milliseconds, learnt as it goes
+    this.perPixel = 4e-3;  // milliseconds, learnt as it goes
     this.keys = new Set();
     this.fingers = new Map();
     this.flight = null;  // {at: share of the way → pose, seconds, button, word}
