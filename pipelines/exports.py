@@ -20,6 +20,7 @@ from fieldfuse.errors import InputError
 from fieldfuse.export.cameras import write_cameras
 from fieldfuse.export.crop import LEAST_INSIDE, LEAST_KEPT, cleaned, cropped, kept_share, region_of
 from fieldfuse.export.extras import require
+from fieldfuse.export.georeference import write_georeference
 from fieldfuse.export.sparse import colours_in, points_of_field, stored_points
 from fieldfuse.export.surface import Originals, at_most, surface_of_field, whole_mesh
 from fieldfuse.export.undistorted import write_undistorted
@@ -157,6 +158,8 @@ def export_field(job: Job, ready: Prepared, fitted: Fitted, wish: Wish) -> Expor
         except InputError as error:
             undone |= surfaces
             notes.append(f"points and meshes were left out: {error}")
+    if ready.poses.georeference is not None:
+        out.files += write_georeference(folder, ready.poses.georeference)
     if wanted := (formats - undone) & {"cameras", UNDISTORTED}:
         sparse = starting_points(job, ready, fitted)
         if "cameras" in wanted:

@@ -19,6 +19,7 @@ from fieldfuse.effects.correct import apart
 from fieldfuse.evaluation.failure import failures
 from fieldfuse.evaluation.pictures import method_pictures, moving_pictures
 from fieldfuse.evaluation.report import report_data
+from fieldfuse.export.georeference import write_georeference
 from fieldfuse.export.sparse import thinned
 from fieldfuse.files import write_json
 from fieldfuse.pipelines.exports import put_cameras
@@ -80,6 +81,8 @@ def summarise_poses(job: Job, capture: Capture, poses: PoseResult) -> dict[str, 
         points = find_cloud(posed, job.progress).points
         points = points[thinned(points)]
     put_cameras(job.folder / "exports" / "cameras", posed, points)
+    if poses.georeference is not None:
+        write_georeference(job.folder / "exports", poses.georeference)
     data = base_data(job, capture, poses)
     return {**data, "warnings": unique([*capture.warnings, *poses.warnings]), "exports": [{"path": "exports/cameras/transforms.json"}]}
 
