@@ -16,30 +16,25 @@ import numpy as np
 from fieldfuse.camera import Array, Intrinsics, invert, world_from_opengl
 from fieldfuse.capture.lenses import with_brown_lens
 from fieldfuse.capture.listing import counted, files_in, is_file, natural_key, numbers, read_text, require_folder
-from fieldfuse.capture.posed_list import Listed, listed_capture
+from fieldfuse.capture.posed_list import Listed, exported, listed_capture
 from fieldfuse.capture.types import Capture
 from fieldfuse.capture.xml_file import starts_with
 from fieldfuse.errors import InputError
 
 HEADER = b"# Bundle file v0."
-PLACES = ("", "bundle", "bundler")
 LISTS = ("list.txt", "images.txt", "pictures.txt", "image_list.txt")
 MAX_BYTES = 2**29
 MOST_FILES = 20
 
 
-def bundle_file(folder: Path) -> Path | None:
+def _bundle(folder: Path) -> Path | None:
     """The bundle in a folder (the last of several rounds: `bundle.out` rather than `bundle_010.out`)."""
-    for place in PLACES:
-        found = sorted(files_in(folder / place, "*.out"), key=lambda file: (file.name != "bundle.out", natural_key(file.name)))
-        bundle = next((file for file in found[:MOST_FILES] if starts_with(file, HEADER)), None)
-        if bundle is not None:
-            return bundle
-    return None
+    found = sorted(files_in(folder, "*.out"), key=lambda file: (file.name != "bundle.out", natural_key(file.name)))
+    return next((file for file in found[:MOST_FILES] if starts_with(file, HEADER)), None)
 
 
 def looks_like_bundler(path: Path) -> bool:
-    return bundle_file(path) is not None
+    return exported(path, _bundle) is not None
 
 
 def read_bundler(path: Path | str) -> Capture:
@@ -49,10 +44,10 @@ def read_bundler(path: Path | str) -> Capture:
         InputError: the file is broken or has no list of images, or no image exists.
     """
     source = Path(path).absolute()
-    file = source if source.is_file() else bundle_file(require_folder(source))
+    file = source if source.is_file() else exported(require_folder(source), _bundle)
     if file is None:
         raise InputError(f"{source} holds no bundle.out of Bundler; export one there")
-    root = file.parent if source.is_file() or file.parent == source else source
+    root = source if source.is_dir() else file.parent
     names = _names(file, root)
     lines = (line for line in read_text(file, MAX_BYTES).splitlines() if line.strip() and not line.lstrip().startswith("#"))
     counts = numbers(next(lines, "").split(), f"{file}: the numbers of cameras and points", 2)

@@ -20,7 +20,7 @@ from fieldfuse.camera import FISHEYE, Array, Intrinsics
 from fieldfuse.capture.calibration import usable_size
 from fieldfuse.capture.lenses import with_brown_lens, with_fitted_lens
 from fieldfuse.capture.listing import counted, files_in, natural_key, numbers, read_object, require_folder
-from fieldfuse.capture.posed_list import Listed, listed_capture
+from fieldfuse.capture.posed_list import Listed, exported, listed_capture
 from fieldfuse.capture.types import Capture
 from fieldfuse.errors import InputError
 
@@ -54,7 +54,7 @@ def _files(folder: Path, suffix: str) -> list[Path]:
 
 
 def looks_like_meshroom(path: Path) -> bool:
-    return bool(scenes_of(path))
+    return bool(exported(path, scenes_of))
 
 
 def read_meshroom(path: Path | str) -> Capture:
@@ -64,7 +64,7 @@ def read_meshroom(path: Path | str) -> Capture:
         InputError: no poses, a lens that cannot be modelled, or no image exists.
     """
     source = Path(path).absolute()
-    files = [source] if source.is_file() else scenes_of(require_folder(source))
+    files = [source] if source.is_file() else exported(require_folder(source), scenes_of)
     if not files:
         raise InputError(f"{source} holds no .sfm file of Meshroom; write one there with the node ConvertSfMFormat")
     scenes = [(file, read_object(file)) for file in files]

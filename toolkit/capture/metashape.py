@@ -24,7 +24,7 @@ from fieldfuse.capture.calibration import usable_size
 from fieldfuse.capture.headers import PANORAMA
 from fieldfuse.capture.lenses import with_brown_lens
 from fieldfuse.capture.listing import counted, files_in, natural_key, numbers, require_folder
-from fieldfuse.capture.posed_list import Listed, listed_capture
+from fieldfuse.capture.posed_list import Listed, exported, listed_capture
 from fieldfuse.capture.poses import checked_pose
 from fieldfuse.capture.types import Capture
 from fieldfuse.capture.xml_file import read_xml, starts_with
@@ -38,14 +38,14 @@ SKEWED = 0.05  # of the focal length
 GEOCENTRIC = 6.2e6  # metres from the origin beyond which coordinates are geocentric
 
 
-def metashape_file(folder: Path) -> Path | None:
+def _export(folder: Path) -> Path | None:
     """The exported cameras in a folder: `cameras.xml`, else the first file that begins like one."""
     found = sorted(files_in(folder, "*.xml"), key=lambda file: (file.name != "cameras.xml", natural_key(file.name)))
     return next((file for file in found[:MOST_FILES] if starts_with(file, b"<document", b"<chunk")), None)
 
 
 def looks_like_metashape(path: Path) -> bool:
-    return metashape_file(path) is not None
+    return exported(path, _export) is not None
 
 
 def read_metashape(path: Path | str) -> Capture:
@@ -55,7 +55,7 @@ def read_metashape(path: Path | str) -> Capture:
         InputError: no camera is aligned, a lens that is none of a perspective or fisheye image, or broken XML.
     """
     source = Path(path).absolute()
-    file = source if source.is_file() else metashape_file(require_folder(source))
+    file = source if source.is_file() else exported(require_folder(source), _export)
     if file is None:
         raise InputError(f"{source} holds no cameras of Metashape; export them as XML there (File › Export › Export Cameras)")
     chunks = [chunk for chunk in read_xml(file).iter("chunk") if chunk.find("cameras") is not None]
@@ -92,7 +92,8 @@ def read_metashape(path: Path | str) -> Capture:
         entries = [replace(entry, pose=level.poses(entry.pose)) for entry in entries]
         place = {"latitude": latitude, "longitude": longitude, "altitude": altitude}
         facts = {"up": (0.0, 0.0, 1.0), "metric": True, "extra": {"reference_lla": place}}
-    return listed_capture("metashape", file, entries, warnings=[*remarks, *lens_remarks], **facts)
+    root = source if source.is_dir() else file.parent
+    return listed_capture("metashape", file, entries, root, warnings=[*remarks, *lens_remarks], **facts)
 
 
 def _aligned(chunk: Element, lenses: dict[str, Intrinsics]) -> tuple[list[Element], dict[str, int]]:

@@ -6,7 +6,7 @@ import posixpath
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
 from fieldfuse.camera import Array, Intrinsics
 from fieldfuse.capture.calibration import fitted
@@ -18,6 +18,8 @@ from fieldfuse.capture.resolve import CaptureFiles, Found
 from fieldfuse.capture.types import Capture, Frame
 
 BESIDE = 0.5  # of an image's side by which a principal point may lie outside: images may have been cropped since
+T = TypeVar("T")
+MOST_FOLDERS = 100
 FOLDERS = ("", "images", "imgs", "photos", "input")  # where images lie beside the file that lists them, the usual ones first
 
 
@@ -73,6 +75,15 @@ def listed_capture(kind: str, source: Path, entries: Sequence[Listed], root: Pat
         remarks.append(f"{counted(unregistered, 'image')} beside these have no pose in {source.name} and are left out")
     extra = {"listed": len(entries), "missing": missing, "unregistered": unregistered, **facts.pop("extra", {})}
     return assemble(kind, root or source.parent, frames, remarks, extra=extra, **facts)
+
+
+def exported(folder: Path, find: Callable[[Path], T | None]) -> T | None:
+    """What `find` finds in the folder, else in the only one of its folders that has it and no images of its own (`photos/`, `export/`)."""
+    if (own := find(folder)) or not folder.is_dir():
+        return own
+    below = sorted(path for path in folder.iterdir() if path.is_dir() and not path.is_symlink() and not path.name.startswith("."))
+    found = [one for path in below[:MOST_FOLDERS] if (one := find(path)) and not any(images_in(path / name) for name in FOLDERS)]
+    return found[0] if len(found) == 1 else None
 
 
 def _find(folder: CaptureFiles, names: Sequence[str], source: Path) -> Found:

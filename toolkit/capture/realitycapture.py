@@ -24,7 +24,7 @@ from scipy.spatial.transform import Rotation
 from fieldfuse.camera import Array, Intrinsics, invert, world_from_opengl
 from fieldfuse.capture.lenses import with_brown_lens, with_division_lens
 from fieldfuse.capture.listing import counted, files_in, images_in, natural_key, numbers, read_text, require_folder
-from fieldfuse.capture.posed_list import Listed, listed_capture
+from fieldfuse.capture.posed_list import Listed, exported, listed_capture
 from fieldfuse.capture.poses import single_frame
 from fieldfuse.capture.types import Capture
 from fieldfuse.capture.xml_file import read_xml, starts_with
@@ -42,13 +42,13 @@ PLACES = ("", "images")
 BROWN = ("brown3", "brown3t2", "brown4", "brown4t2")
 
 
-def table_of(folder: Path) -> Path | None:
+def _table(folder: Path) -> Path | None:
     """The table of cameras in a folder."""
     files = sorted(files_in(folder, "*.csv"), key=lambda file: natural_key(file.name))
     return next((file for file in files[:MOST_FILES] if starts_with(file, b"name", b"roll") or starts_with(file, b"name", b"R22")), None)
 
 
-def sidecars_of(folder: Path) -> list[tuple[Path, Path]]:
+def _sidecars(folder: Path) -> list[tuple[Path, Path]]:
     """Images with the XMP file that gives their pose, of the first usual folder that has some."""
     for place in PLACES:
         files = {file.stem: file for file in files_in(folder / place, "*.[xX][mM][pP]")}
@@ -63,7 +63,7 @@ def _has_pose(xmp: Path) -> bool:
 
 
 def looks_like_realitycapture(path: Path) -> bool:
-    return table_of(path) is not None or bool(sidecars_of(path))
+    return exported(path, _table) is not None or bool(_sidecars(path))
 
 
 def read_realitycapture(path: Path | str) -> Capture:
@@ -73,10 +73,10 @@ def read_realitycapture(path: Path | str) -> Capture:
         InputError: a column is missing, positions are degrees, a lens cannot be modelled, or no image exists.
     """
     source = Path(path).absolute()
-    table = source if source.is_file() else table_of(require_folder(source))
+    table = source if source.is_file() else exported(require_folder(source), _table)
     if table is not None:
-        return _read_table(table)
-    pairs = sidecars_of(source)
+        return _read_table(table, source if source.is_dir() else table.parent)
+    pairs = _sidecars(source)
     if not pairs:
         raise InputError(f"{source} holds no cameras of RealityCapture; export the registration as CSV or XMP there")
     entries = []
@@ -85,13 +85,13 @@ def read_realitycapture(path: Path | str) -> Capture:
             entries.append(_from_xmp(image, xmp))
     if not entries:
         raise InputError(f"none of the {counted(len(pairs), 'XMP file')} in {source} can be read; export them again")
-    return listed_capture("realitycapture", pairs[0][1], entries, up=(0.0, 0.0, 1.0))
+    return listed_capture("realitycapture", pairs[0][1], entries, source, up=(0.0, 0.0, 1.0))
 
 
 # ------------------------------------------------------------------------------------------------ table
 
 
-def _read_table(table: Path) -> Capture:
+def _read_table(table: Path, root: Path) -> Capture:
     rows, columns = _rows(table)
     entries = [_from_row(row, f"{table}, row {number}") for number, row in rows]
     remarks = []
@@ -99,7 +99,7 @@ def _read_table(table: Path) -> Capture:
         _refuse_degrees(np.array([entry.pose[:3, 3] for entry in entries]), table)
     if all(row.get("k1") not in (None, "", "0") and not any(_number(row, key, "") for key in ("k2", "k3")) for _, row in rows):
         remarks.append(f"{table.name} does not have the lens model; its k1 is taken as Brown's, not as that of the division model")
-    return listed_capture("realitycapture", table, entries, up=(0.0, 0.0, 1.0), warnings=remarks)
+    return listed_capture("realitycapture", table, entries, root, up=(0.0, 0.0, 1.0), warnings=remarks)
 
 
 def _rows(table: Path) -> tuple[list[tuple[int, dict[str, str]]], set[str]]:
