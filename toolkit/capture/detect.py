@@ -43,7 +43,7 @@ from fieldfuse.capture.record3d import holds_record3d, looks_like_record3d, read
 from fieldfuse.capture.redwood import looks_like_redwood, read_redwood
 from fieldfuse.capture.replica import looks_like_replica, read_replica
 from fieldfuse.capture.resolve import CaptureFiles
-from fieldfuse.capture.rgbd_folder import looks_like_rgbd, read_rgbd
+from fieldfuse.capture.rgbd_folder import looks_like_rgbd, read_rgbd, unused_depth
 from fieldfuse.capture.scanner3d import looks_like_scanner3d, read_scanner3d
 from fieldfuse.capture.scannet import looks_like_scannet, read_scannet, read_sens
 from fieldfuse.capture.scannetpp import looks_like_scannetpp, read_scannetpp
@@ -130,6 +130,11 @@ def _descended(folder: Path, below: Path) -> Capture:
     # What its json lists may lie beside its folder.
     capture = read_transforms(below, within=folder) if detect_kind(below) == "transforms" else read_source(below)
     return replace(capture, warnings=(f"the capture was found in {below.relative_to(folder).as_posix()}/", *capture.warnings))
+
+
+def _photos_of(folder: Path) -> Capture:
+    capture = read_photos(folder)
+    return capture.with_frames(capture.frames, *unused_depth(folder))
 
 
 def _photos_without_film(path: Path) -> bool:
@@ -230,7 +235,9 @@ def _read_folder(folder: Path) -> Capture:
             if looks_like(folder):
                 if kind in POSED_IMAGES:
                     return _best_of(folder, kind)
-                return (_posed_below(folder) if kind == "photos" else None) or read(folder)
+                if kind == "photos":
+                    return _posed_below(folder) or _photos_of(folder)
+                return read(folder)
         videos = images_in(folder, FILMS)
     except OSError as error:
         raise InputError(f"cannot read {error.filename or folder}: {error.strerror or error}") from error

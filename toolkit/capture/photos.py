@@ -30,7 +30,10 @@ from fieldfuse.files import require_utf8
 
 FOLDERS = (".", "images", "input")
 DEEP, MOST_FILES = 3, 100_000
-OWN_CAPTURE = re.compile(r"transforms.*\.json|poses_bounds\.npy|cameras.*\.npz|sparse|colmap|run\.json|groundtruth\.txt|.*\.(sens|r3d)")
+OWN_CAPTURE = re.compile(
+    r"transforms.*\.json|poses_bounds\.npy|cameras.*\.(npz|xml|txt|bin)|sparse|colmap|run\.json|groundtruth\.txt|reconstruction\.json"
+    r"|bundle\.out|.*\.(sens|r3d|sfm|traj)"
+)
 NO_PHOTOS = {
     *("depth", "depths", "disparity", "normal", "normals", "confidence", "flow", "segmentation", "segmentations", "semantic", "labels"),
     *("thumb", "thumbs", "thumbnail", "thumbnails", "preview", "previews", "render", "renders", "results", "output", "outputs"),
