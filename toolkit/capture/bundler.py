@@ -70,7 +70,8 @@ def read_bundler(path: Path | str) -> Capture:
 def _names(file: Path, root: Path) -> list[str]:
     stem = file.name.removesuffix(".out").removesuffix(".bundle")
     beside = (f"{file.name}.list.txt", f"{stem}.list.txt", *LISTS)
-    found = next((place / name for place in (file.parent, root) for name in beside if is_file(place / name)), None)
+    places = (file.parent, root, root / "prepare")  # the last as RunSFM leaves it
+    found = next((place / name for place in places for name in beside if is_file(place / name)), None)
     if found is None:
         raise InputError(f"{file} has no list of its images beside it; add list.txt with their names, one a line, in the cameras' order")
     lines = [line.strip() for line in read_text(found).splitlines() if line.strip()]
