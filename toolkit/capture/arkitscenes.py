@@ -67,7 +67,7 @@ def read_arkitscenes(path: Path | str) -> Capture:
             depth, confidence = _nearest(depths, time), _nearest(trusted, time)
             frames.append(posed_frame(image.stem, image, _lens(lens), invert(pose), where, depth, confidence=confidence))
     remarks = [f"{lost} of {counted(len(images), 'image')} have no pose or camera of their time and are left out"] if lost else []
-    return assemble("arkitscenes", given, frames, remarks, ordered=True, metric=True, up=(0.0, 0.0, 1.0), alpha=False)
+    return assemble("arkitscenes", given, frames, remarks, ordered=True, metric=True, up=(0.0, 0.0, 1.0))
 
 
 def _time(file: Path) -> float | None:
