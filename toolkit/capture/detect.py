@@ -59,7 +59,6 @@ from fieldfuse.files import require_utf8
 
 FILMS = (*VIDEO_SUFFIXES, RECORD3D)
 DEEPEST, MOST_FOLDERS = 3, 200  # where captures are looked for that are not in the given folder itself
-CAMERA_RAW = (".dng", ".cr2", ".cr3", ".nef", ".arw", ".raf", ".orf", ".rw2", ".pef", ".srw")
 # Kinds without depth, whose files may lie together.
 POSED_IMAGES = ("transforms", "blender", "metashape", "realitycapture", "opensfm", "meshroom", "bundler", "colmap", "llff")
 FEWER = 0.8  # of the images that another has poses for, below which the first of several is not used
@@ -197,7 +196,7 @@ def _read_file(path: Path) -> Capture:
         return exported(path)
     if suffix == ".json":
         return read_blender(path.parent) if path.name.startswith("transforms_") else read_transforms(path)
-    if suffix in (*IMAGES, *CAMERA_RAW):
+    if suffix in IMAGES:
         raise InputError(f"{path} is one image, and one cannot show depth; give the folder that holds all of them")
     if suffix in ARCHIVES:  # only Record3D's recordings are read from a zip file, since the app itself writes it so
         if suffix != RECORD3D and not holds_record3d(path):
@@ -247,11 +246,6 @@ def _read_folder(folder: Path) -> Capture:
         return video.with_frames(video.frames, *cover)
     if videos:
         raise InputError(f"{folder} holds {len(videos)} videos; give one of them, for instance {videos[0]}")
-    raw = images_in(folder, CAMERA_RAW)
-    if raw:
-        names = some_of([file.name for file in raw], 1)
-        what = f"{folder} holds {counted(len(raw), 'camera raw file')} ({names}), which cannot be read"
-        raise InputError(f"{what}; develop them to JPEG, all in the same way")
     below = _read_below(folder)
     if below is not None:
         return below
