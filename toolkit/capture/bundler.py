@@ -23,7 +23,7 @@ from fieldfuse.errors import InputError
 
 HEADER = b"# Bundle file v0."
 LISTS = ("list.txt", "images.txt", "pictures.txt", "image_list.txt")
-MAX_BYTES = 2**29
+MAX_BYTES = 2**28
 MOST_FILES = 20
 
 

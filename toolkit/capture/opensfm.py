@@ -28,7 +28,7 @@ from fieldfuse.files import read_json
 
 NAME = "reconstruction.json"
 PLACES = (f"opensfm/{NAME}", NAME, f"opensfm/undistorted/{NAME}")
-MAX_BYTES = 2**29  # it holds the points, too
+MAX_BYTES = 2**28  # it holds the points, too
 ROUND = ("spherical", "equirectangular", "dual")
 SAME_PLACE = 1e-9  # degrees
 
