@@ -45,7 +45,7 @@ BROWN = ("brown3", "brown3t2", "brown4", "brown4t2")
 def _table(folder: Path) -> Path | None:
     """The table of cameras in a folder."""
     files = sorted(files_in(folder, "*.csv"), key=lambda file: natural_key(file.name))
-    return next((file for file in files[:MOST_FILES] if starts_with(file, b"name", b"roll") or starts_with(file, b"name", b"R22")), None)
+    return next((file for file in files[:MOST_FILES] if any(starts_with(file, b"#name,", word) for word in (b",roll,", b",R22,"))), None)
 
 
 def _sidecars(folder: Path) -> list[tuple[Path, Path]]:

@@ -2,7 +2,7 @@
 with `resized_images/` (fisheye). `path` is the scene or its `dslr/`.
 
 The json is nerfstudio's, but for the images' folder, which it does not name; `test_frames` stands beside `frames`. Poses are metres.
-`train_test_lists.json` gives the split.
+`train_test_lists.json` gives the split. Frames with `is_bad` are left out.
 """
 
 from __future__ import annotations
@@ -11,7 +11,7 @@ from dataclasses import replace
 from pathlib import Path
 
 from fieldfuse.capture import nerf_json
-from fieldfuse.capture.listing import assemble, images_in, is_file, read_object, require_folder
+from fieldfuse.capture.listing import assemble, counted, images_in, is_file, read_object, require_folder
 from fieldfuse.capture.resolve import CaptureFiles
 from fieldfuse.capture.types import Capture
 from fieldfuse.errors import InputError
@@ -52,10 +52,13 @@ def read_scannetpp(path: Path | str) -> Capture:
     entries = [dict(entry, split="train") for entry in nerf_json.frame_list(data, json_path)]
     if data.get("test_frames"):
         entries += [dict(entry, split="test") for entry in nerf_json.frame_list({"frames": data["test_frames"]}, json_path)]
+    bad = [entry for entry in entries if entry.get("is_bad") is True]
+    entries = [entry for entry in entries if entry.get("is_bad") is not True]
     splits = _splits(folder)
     files = CaptureFiles(folder)
     listed = [(data, entry, f"frame {index} ({entry['file_path'][:80]}) of {json_path.name}") for index, entry in enumerate(entries)]
     there, frames, remarks = nerf_json.read_listed(files, listed, json_path.name, images)
+    remarks += [f"{counted(len(bad), 'image')} marked as bad (blurred or shadowed) in {json_path.name} are left out"] if bad else []
     out = []
     for index, frame in zip(there, frames, strict=True):
         mask = entries[index].get("mask_path")
