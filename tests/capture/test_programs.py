@@ -19,7 +19,7 @@ from fieldfuse.errors import InputError
 from fieldfuse.georeference import ecef
 from tests.capture import programs
 from tests.capture.layouts import write_colmap_bin, write_transforms
-from tests.capture.made import Eye, Pinhole, eyes, pixel_error, render, surface_points
+from tests.capture.made import Eye, Pinhole, eyes, pixel_error, render, save_picture, surface_points
 
 Lens = Callable[[Array, Array], tuple[Array, Array]]  # ideal x/z and y/z → distorted
 
@@ -110,12 +110,30 @@ def test_metashape_lens(tmp_path: Path, k4: float, pixels: float) -> None:
 def test_metashape_fisheye(tmp_path: Path) -> None:
     write_with(tmp_path, "<k1>-0.04</k1><k2>0.02</k2><k3>-0.01</k3><k4>0.003</k4>", "fisheye")
     assert lens_error(open_capture(tmp_path), programs.OFF_CENTRE, by_angle([-0.04, 0.02, -0.01, 0.003])) < 1e-6
-    with pytest.raises(InputError, match=r"panorama|360"):
+    with pytest.raises(InputError, match="twice as wide as high"):
         write_with(tmp_path, "", "spherical")
         open_capture(tmp_path)
     with pytest.raises(InputError, match=r"type .rpc. is not supported"):
         write_with(tmp_path, "", "rpc")
         open_capture(tmp_path)
+
+
+def test_panoramas_with_poses(tmp_path: Path) -> None:
+    """The middle looks along the camera's axis, longitude goes to the right and latitude down."""
+    programs.write_metashape(tmp_path / "a")
+    programs.write_opensfm(tmp_path / "b")
+    change_camera(tmp_path / "b", {"projection_type": "spherical", "width": 80, "height": 40})
+    xml = tmp_path / "a/cameras.xml"
+    xml.write_text(xml.read_text().replace('type="frame"', 'type="spherical"').replace('height="60"', 'height="40"'))
+    for image in (*(tmp_path / "a/photos").iterdir(), *(tmp_path / "b/images").iterdir()):
+        save_picture(image, render(eyes()[0], programs.CENTRED)[0][:40])
+    for capture in (open_capture(tmp_path / "a"), open_capture(tmp_path / "b")):
+        for frame, eye in zip(capture.frames, eyes(), strict=True):
+            offset = surface_points() - eye.centre
+            across, down, along = (offset @ axis for axis in (eye.right, eye.down, eye.forward))
+            longitude, latitude = np.arctan2(across, along), np.arctan2(down, np.hypot(across, along))
+            true = np.stack([40 + 80 * longitude / (2 * np.pi), 20 + 40 * latitude / np.pi], axis=1)
+            np.testing.assert_allclose(project(frame.intrinsics, frame.world_from_camera, surface_points())[0], true, atol=1e-6)
 
 
 def test_metashape_leaves_out_disabled_cameras_and_smaller_components(tmp_path: Path) -> None:
@@ -286,7 +304,7 @@ def test_opensfm_cameras(tmp_path: Path) -> None:
     assert "5 images of another size than in reconstruction.json; intrinsics were scaled to fit" in capture.warnings
     change_camera(tmp_path, {**plain, "projection_type": "fisheye"})
     assert lens_error(open_capture(tmp_path), centred, by_angle([-0.2, 0.1])) < 1e-6
-    for kind, why in (("equirectangular", "panorama|360"), ("fisheye624", "not supported")):
+    for kind, why in (("equirectangular", "twice as wide as high"), ("fisheye624", "not supported")):
         change_camera(tmp_path, {**plain, "projection_type": kind})
         with pytest.raises(InputError, match=why):
             open_capture(tmp_path)

@@ -7,7 +7,8 @@ cameras' middle.
 
 Lens (user manual, "Camera models"): x = X/Z, y = Y/Z, r² = x² + y²,
 x' = x (1 + k1 r² + k2 r⁴ + k3 r⁶ + k4 r⁸) + p1 (r² + 2x²) + 2 p2 x y, y' likewise with x and y, p1 and p2 exchanged: OpenCV's p2 and p1;
-u = w/2 + cx + x' (f + b1) + y' b2, v = h/2 + cy + y' f. A fisheye's x and y are first scaled to the angle from the axis.
+u = w/2 + cx + x' (f + b1) + y' b2, v = h/2 + cy + y' f. A fisheye's x and y are first scaled to the angle from the axis. A
+spherical sensor's images are panoramas whose middle looks along z.
 """
 
 from __future__ import annotations
@@ -20,8 +21,7 @@ from xml.etree.ElementTree import Element
 import numpy as np
 
 from fieldfuse.camera import FISHEYE, Intrinsics, Similarity
-from fieldfuse.capture.calibration import usable_size
-from fieldfuse.capture.headers import PANORAMA
+from fieldfuse.capture.calibration import panorama, usable_size
 from fieldfuse.capture.lenses import with_brown_lens
 from fieldfuse.capture.listing import counted, files_in, natural_key, numbers, require_folder
 from fieldfuse.capture.posed_list import Listed, exported, listed_capture
@@ -32,7 +32,7 @@ from fieldfuse.errors import InputError
 from fieldfuse.georeference import Georeference, geographic
 
 MOST_FILES = 20
-ROUND = ("spherical", "cylindrical", "equirectangular")
+SPHERE = "spherical"
 SHIFT = 0.5  # pixels by which what OpenCV's lens lacks (skew, a fisheye's tangential terms) may move a point without a word
 SKEWED = 0.05  # of the focal length
 GEOCENTRIC = 6.2e6  # metres from the origin beyond which coordinates are geocentric
@@ -149,11 +149,19 @@ def _lenses(chunk: Element, file: Path) -> tuple[dict[str, Intrinsics], list[str
         calibrations = sorted(sensor.findall("calibration"), key=lambda one: one.get("class") != "adjusted")
         kind = sensor.get("type") or "frame"
         where = f"{file}, sensor {(sensor.get('label') or sensor.get('id') or '')[:40]!r}"
-        if kind in ROUND:
-            raise InputError(f"{where}: {PANORAMA}")
-        if calibrations:
+        if kind == SPHERE:
+            out[sensor.get("id") or ""] = panorama(*_size(sensor, None, where), where)
+        elif calibrations:
             out[sensor.get("id") or ""] = _lens(sensor, calibrations[0], kind, where, remarks)
     return out, list(dict.fromkeys(remarks))
+
+
+def _size(sensor: Element, calibration: Element | None, where: str) -> tuple[int, int]:
+    """Of the images that a calibration is for, in pixels."""
+    found = [part.find("resolution") for part in (calibration, sensor) if part is not None]
+    resolution = next((one for one in found if one is not None), None)
+    sides = [] if resolution is None else [resolution.get("width"), resolution.get("height")]
+    return usable_size(*numbers(sides, f"{where}: 'resolution'", 2).tolist(), where)
 
 
 def _lens(sensor: Element, calibration: Element, kind: str, where: str, remarks: list[str]) -> Intrinsics:
@@ -163,10 +171,7 @@ def _lens(sensor: Element, calibration: Element, kind: str, where: str, remarks:
 
     if kind not in ("frame", "fisheye"):
         raise InputError(f"{where}: a camera of type {kind[:40]!r} is not supported; undistort the images in Metashape and export again")
-    resolution = calibration.find("resolution")
-    resolution = sensor.find("resolution") if resolution is None else resolution
-    sides = [] if resolution is None else [resolution.get("width"), resolution.get("height")]
-    width, height = usable_size(*numbers(sides, f"{where}: 'resolution'", 2).tolist(), where)
+    width, height = _size(sensor, calibration, where)
     if calibration.find("f") is None:
         raise InputError(f"{where}: there is no focal length ('f'); export the cameras from Metashape 1.2 or later")
     f, b1, b2 = value("f"), value("b1"), value("b2")

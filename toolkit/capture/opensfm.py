@@ -17,8 +17,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from fieldfuse.camera import FISHEYE, Array, Intrinsics, invert
-from fieldfuse.capture.calibration import usable_size
-from fieldfuse.capture.headers import PANORAMA
+from fieldfuse.capture.calibration import panorama, usable_size
 from fieldfuse.capture.lenses import with_brown_lens
 from fieldfuse.capture.listing import is_file, number, numbers, read_object, require_folder
 from fieldfuse.capture.posed_list import Listed, listed_capture
@@ -29,7 +28,7 @@ from fieldfuse.files import read_json
 NAME = "reconstruction.json"
 PLACES = (f"opensfm/{NAME}", NAME, f"opensfm/undistorted/{NAME}")
 MAX_BYTES = 2**28  # it holds the points, too
-ROUND = ("spherical", "equirectangular", "dual")
+SPHERES = ("spherical", "equirectangular")
 SAME_PLACE = 1e-9  # degrees
 
 
@@ -117,9 +116,9 @@ def _lens(data: Mapping[str, Any], where: str) -> Intrinsics:
         return default if found is None else found
 
     kind = str(data.get("projection_type", "perspective"))
-    if kind in ROUND:
-        raise InputError(f"{where}: {PANORAMA}")
     width, height = usable_size(value("width"), value("height"), where)
+    if kind in SPHERES:
+        return panorama(width, height, where)
     side = max(width, height)
     fx, fy = (value(key, value("focal")) * side for key in ("focal_x", "focal_y"))
     camera = Intrinsics(width, height, fx, fy, width / 2 + value("c_x") * side, height / 2 + value("c_y") * side).checked(where)
