@@ -161,7 +161,8 @@ def _size(sensor: Element, calibration: Element | None, where: str) -> tuple[int
     found = [part.find("resolution") for part in (calibration, sensor) if part is not None]
     resolution = next((one for one in found if one is not None), None)
     sides = [] if resolution is None else [resolution.get("width"), resolution.get("height")]
-    return usable_size(*numbers(sides, f"{where}: 'resolution'", 2).tolist(), where)
+    width, height = numbers(sides, f"{where}: 'resolution'", 2).tolist()
+    return usable_size(width, height, where)
 
 
 def _lens(sensor: Element, calibration: Element, kind: str, where: str, remarks: list[str]) -> Intrinsics:

@@ -348,9 +348,9 @@ def _camera(root: Path, layout: _Layout, size: tuple[int, int]) -> tuple[Intrins
             if factor is not None and not 0 < factor < 1e9:
                 raise InputError(f"{file}: the depth factor is {factor:g}, it must be positive; correct it")
             return camera, factor, file.relative_to(root).as_posix()
-    file = "" if layout.poses is None else f" ({layout.poses.file.name})"
+    lists = "" if layout.poses is None else f" ({layout.poses.file.name})"
     raise InputError(
-        f"{root} holds colour, depth and poses{file} but no camera; "
+        f"{root} holds colour, depth and poses{lists} but no camera; "
         "add intrinsics.txt with fx fy cx cy (pixels), or a 3×3 matrix"
     )
 
