@@ -372,8 +372,33 @@ class TsdfSettings:
 # Files for other programs: "texture" is a mesh with one (textured.glb), "page" the field itself for any browser (field.html), the others
 # are named as they end, or as what they hold.
 DEFAULT_EXPORTS = ("points", "ply", "obj", "glb", "texture", "page", "cameras", "video")
-MORE_EXPORTS: tuple[str, ...] = ()  # made when they are named
+# Made when they are named: points as LAS, LAZ or E57, the textured mesh as USDZ (these need extras), pinhole images with cameras.
+MORE_EXPORTS: tuple[str, ...] = ("las", "laz", "e57", "usdz", "undistorted")
 EXPORTS: tuple[str, ...] = (*DEFAULT_EXPORTS, *MORE_EXPORTS)
+
+
+def crop_box(text: str) -> tuple[list[float], list[float]] | None:
+    """Lowest and highest corner (3,) of a box that is given by six numbers, `x0,y0,z0,x1,y1,z1`; None where the text is something else."""
+    try:
+        values = [float(part) for part in text.split(",")]
+    except ValueError:
+        return None
+    if len(values) != 6 or not all(abs(value) < 1e12 for value in values):  # not of what is not a number
+        return None
+    ends = [sorted(pair) for pair in zip(values[:3], values[3:], strict=True)]
+    return [low for low, _ in ends], [high for _, high in ends]
+
+
+def _check_crop(value: Any) -> Any:
+    value = "off" if value is False else value
+    box = crop_box(value) if isinstance(value, str) else None
+    if value not in CROPS and (box is None or not all(low < high for low, high in zip(*box, strict=True))):
+        sentence = f"it must be one of {', '.join(CROPS)}, or a box as x0,y0,z0,x1,y1,z1 in the frame of the input"
+        raise PydanticCustomError("choice", "{sentence}", {"sentence": sentence})
+    return value
+
+
+CROPS = ("off", "auto", "box", "hull")
 
 
 @dataclass
@@ -386,6 +411,10 @@ class ExportSettings:
     smooth: Annotated[int, Field(ge=0, le=100)] = 2
     texture_size: Positive = 1280  # long side in pixels, at most, of the pictures that a texture is made of
     video_frames: NotNegative = 90
+    # What is exported of the field. off: all | box: what lies in the region of interest | hull: what half of the cameras see of that
+    # | auto: the box where the cameras look at an object, else all | x0,y0,z0,x1,y1,z1: a box in the frame of the input
+    crop: Annotated[str, BeforeValidator(_check_crop)] = "off"
+    clean: bool = False  # without parts that are connected to nothing that two cameras see
 
 
 @dataclass

@@ -13,6 +13,7 @@ import pytest
 from fieldfuse.camera import Intrinsics, project
 from fieldfuse.capture import open_capture
 from fieldfuse.capture.colmap import MODELS, candidate_capture, candidate_models, intrinsics_of, read_colmap, read_model
+from fieldfuse.capture.types import MODEL_NAMES
 from fieldfuse.errors import InputError
 from tests.capture.layouts import OFF_CENTRE, POINTS, half_size, write_colmap_bin, write_colmap_txt
 from tests.capture.made import eyes, pixel_error, render, save_picture
@@ -124,7 +125,10 @@ def test_missing_and_unregistered_pictures_are_counted(tmp_path: Path) -> None:
     write_colmap_bin(tmp_path)
     (tmp_path / "images/view 3.png").rename(tmp_path / "images/other.png")
     capture = open_capture(tmp_path)
+    names = capture.extra.pop(MODEL_NAMES)
     assert capture.extra == {"listed": 5, "missing": 1, "unregistered": 1}
+    assert set(names) == {frame.name for frame in capture.frames}
+    assert all(frame.image.as_posix().endswith(names[frame.name]) for frame in capture.frames)
     assert len(capture.warnings) == 2
     for path in (tmp_path / "images").iterdir():
         path.unlink()

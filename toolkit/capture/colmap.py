@@ -28,7 +28,7 @@ from fieldfuse.capture.listing import assemble, counted, images_in, natural_key,
 from fieldfuse.capture.masks import masks_among
 from fieldfuse.capture.poses import checked_place, rigid
 from fieldfuse.capture.resolve import CaptureFiles, Found
-from fieldfuse.capture.types import Capture, Frame
+from fieldfuse.capture.types import MODEL_NAMES, Capture, Frame
 from fieldfuse.errors import InputError, first_line
 
 USUAL = re.compile(r"((colmap|dense|distorted|undistorted)/(\d+/)?)*sparse(/\d+)?|\.")
@@ -174,13 +174,14 @@ def candidate_capture(root: Path, candidate: CandidateModel) -> Capture:
     if not images:
         raise CaptureFiles(_above_model(root)).none_exists(f"the model {candidate.name}", listed, Found([], outside=candidate.outside))
     located, warnings = sorted(images), list(candidate.remarks)
-    frames, scaled = [], 0
+    frames, scaled, names = [], 0, {}
     for index, name in zip(located, unique_names([images[index] for index in located]), strict=True):
         entry = model.images[index]
         described = model.cameras[entry.camera]
         intrinsics = fitted(described, image_header(images[index]).size, f"{entry.name} in {root / candidate.name}", images[index])
         scaled += intrinsics is not described
         frames.append(Frame(name=name, image=images[index], intrinsics=intrinsics, world_from_camera=entry.world_from_camera))
+        names[name] = entry.name
     missing = listed - len(frames)
     if missing:
         warnings.append(f"{missing} of the {listed} images of the model do not exist; the other {len(frames)} are used")
@@ -193,7 +194,7 @@ def candidate_capture(root: Path, candidate: CandidateModel) -> Capture:
         unregistered += len(set(beside) - used - masks_among(beside))
     if unregistered:
         warnings.append(f"{counted(unregistered, 'image')} beside these are not in the model and are left out")
-    extra = {"listed": listed, "missing": missing, "unregistered": unregistered}
+    extra = {"listed": listed, "missing": missing, "unregistered": unregistered, MODEL_NAMES: names}
     return assemble("colmap", root, frames, warnings, points=model.points if len(model.points) else None, extra=extra)
 
 
