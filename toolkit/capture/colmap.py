@@ -242,11 +242,12 @@ def _fit(model: Model, found: Found) -> tuple[int, float]:
 
 
 def _above_model(root: Path) -> Path:
-    """The folder that holds a model's images: above `root` when this is the model's own folder (`sparse/0`, `colmap/sparse`)."""
+    """The folder that holds a model's images: above `root` when this is the model's own folder (`sparse/0`, `colmap/sparse`,
+    `distorted/sparse/1`)."""
     top = root.resolve()
     if top.name.isdecimal() and top.parent.name == "sparse":
         top = top.parent
-    for name in ("sparse", "colmap"):
+    for name in ("sparse", "colmap", "distorted"):
         top = top.parent if top.name == name else top
     return top
 
