@@ -73,7 +73,12 @@ def page(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.fixture
 def open_page(browser: Driven, page: Path) -> Driven:
-    opened(browser, page, *WINDOW)
+    """As it opens: loaded again only where a test left it."""
+    if browser.run("location.href") == page.as_uri() and not browser.run("window.drawn"):
+        browser.run("fieldfuse.tools.open(null), fieldfuse.tools.points = [], fieldfuse.to(2)")
+        until(lambda: browser.run("!fieldfuse.walker.journey"))
+    else:
+        opened(browser, page, *WINDOW)
     return browser
 
 
