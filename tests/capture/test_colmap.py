@@ -30,6 +30,7 @@ PARAMETERS = {
     "RADIAL_FISHEYE": [70, 41, 29, 0.08, -0.03],
     "SIMPLE_FISHEYE": [70, 41, 29],
     "FISHEYE": [70, 72, 41, 29],
+    "EQUIRECTANGULAR": [80, 60],
 }
 
 
