@@ -79,6 +79,11 @@ class Georeference:
         up = [math.cos(north) * math.cos(east), math.cos(north) * math.sin(east), math.sin(north)]
         return np.array([turn, np.cross(up, turn), up])
 
+    def enu_from_ecef(self) -> Similarity:
+        """Metres east, north and up of the origin from geocentric metres."""
+        axes = self._axes()
+        return Similarity(1.0, axes, -(axes @ ecef(self.origin)))
+
     def to_enu(self, points: Array) -> Array:
         """(..., 3) points in the frame of exports → (..., 3) metres east, north and up of the origin, float64."""
         return self.enu_from_input.points(points)

@@ -30,6 +30,7 @@ PARAMETERS = {
     "RADIAL_FISHEYE": [70, 41, 29, 0.08, -0.03],
     "SIMPLE_FISHEYE": [70, 41, 29],
     "FISHEYE": [70, 72, 41, 29],
+    "EQUIRECTANGULAR": [80, 60],
 }
 
 
@@ -75,7 +76,7 @@ def test_what_pycolmap_writes(tmp_path: Path, suffix: str) -> None:
     np.testing.assert_allclose(sorted(capture.points.tolist()), sorted(POINTS.tolist()))
 
 
-@pytest.mark.parametrize("place", ["sparse/0", "sparse", "colmap/sparse/0", "colmap/sparse", "."])
+@pytest.mark.parametrize("place", ["sparse/0", "sparse", "colmap/sparse/0", "colmap/sparse", "distorted/sparse/0", "."])
 def test_places_of_the_model(tmp_path: Path, place: str) -> None:
     write_colmap_bin(tmp_path)
     if place != "sparse/0":
@@ -227,6 +228,9 @@ def move(root: Path, *moves: tuple[str, str]) -> None:
         ([("images", "dense/0/images"), ("sparse/0", "dense/0/sparse")], None),
         ([("images", "scene/images"), ("sparse", "scene/sparse")], "the capture was found in scene"),
         ([("sparse/0", "distorted/sparse/1")], None),
+        ([("sparse/0", "dense/0")], "the COLMAP model was found in dense/0"),
+        ([("sparse/0", "dense/sparse")], None),
+        ([("sparse/0", "dense/0"), ("images", "dense/0/images")], "the capture was found in dense/0"),
     ],
 )
 def test_where_models_and_images_are_found(tmp_path: Path, moves: list[tuple[str, str]], said: str | None) -> None:

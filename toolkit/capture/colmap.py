@@ -20,7 +20,7 @@ from pathlib import Path
 
 import numpy as np
 
-from fieldfuse.camera import FISHEYE, OPENCV, PINHOLE, Array, Intrinsics, invert
+from fieldfuse.camera import EQUIRECTANGULAR, FISHEYE, OPENCV, PINHOLE, Array, Intrinsics, invert
 from fieldfuse.capture.calibration import fits_shape, fitted, usable_size
 from fieldfuse.capture.headers import image_header
 from fieldfuse.capture.images import spread
@@ -55,7 +55,7 @@ MODELS = (  # by COLMAP's numbers: name, parameters, and our lens, where it has 
     ("SIMPLE_FISHEYE", 3, FISHEYE),
     ("FISHEYE", 4, FISHEYE),
     ("EUCM", 6, None),
-    ("EQUIRECTANGULAR", 2, None),
+    ("EQUIRECTANGULAR", 2, EQUIRECTANGULAR),
 )
 SUPPORTED = {name: (count, lens) for name, count, lens in MODELS if lens is not None}
 ONE_FOCAL = ("SIMPLE_PINHOLE", "SIMPLE_RADIAL", "RADIAL", "SIMPLE_RADIAL_FISHEYE", "RADIAL_FISHEYE", "SIMPLE_FISHEYE")
@@ -242,11 +242,12 @@ def _fit(model: Model, found: Found) -> tuple[int, float]:
 
 
 def _above_model(root: Path) -> Path:
-    """The folder that holds a model's images: above `root` when this is the model's own folder (`sparse/0`, `colmap/sparse`)."""
+    """The folder that holds a model's images: above `root` when this is the model's own folder (`sparse/0`, `colmap/sparse`,
+    `distorted/sparse/1`)."""
     top = root.resolve()
     if top.name.isdecimal() and top.parent.name == "sparse":
         top = top.parent
-    for name in ("sparse", "colmap"):
+    for name in ("sparse", "colmap", "distorted"):
         top = top.parent if top.name == name else top
     return top
 
@@ -285,6 +286,8 @@ def intrinsics_of(model: str, width: int, height: int, values: list[float], wher
     count, kind = SUPPORTED[model]
     if len(values) != count:
         raise InputError(f"{where}: the camera model {model} has {count} parameters, not {len(values)}; check how the file was written")
+    if kind == EQUIRECTANGULAR:  # its parameters are the image's size
+        return Intrinsics.equirectangular(*usable_size(width, height, where))
     fx, fy, cx, cy, *lens = [values[0], *values] if model in ONE_FOCAL else values
     if kind != PINHOLE:
         lens += [0.0] * (4 - len(lens))

@@ -107,6 +107,15 @@ FILES = {
     "stray": ("odometry.csv", "camera_matrix.csv", "depth/000001.png"),
     "record3d": ("metadata", "metadata", "rgbd/1.depth", "rgbd/0.depth", "rgbd/2.conf", "rgbd/0.jpg"),
     "scanner3d": ("frame_00002.json", "frame_00004.json", "depth_00002.png", "conf_00000.png"),
+    "metashape": ("cameras.xml",),
+    "realitycapture": ("registration.csv",),
+    "xmp": ("IMG_02.xmp", "IMG_03.xmp"),
+    "opensfm": ("opensfm/reconstruction.json",),
+    "meshroom": ("MeshroomCache/StructureFromMotion/0a1b/cameras.sfm",),
+    "bundler": ("bundle.out", "list.txt"),
+    "scannetpp": ("dslr/nerfstudio/transforms_undistorted.json", "dslr/train_test_lists.json"),
+    "rgbd": ("truth_cam_poses.txt", "TUM3.yaml", "depth_imgs/0001_depth_raw.png"),
+    "arkitscenes": ("lowres_wide.traj", "lowres_wide_intrinsics/41069021_305.377.pincam", "lowres_depth/41069021_305.477.png"),
 }
 
 
