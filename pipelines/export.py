@@ -16,7 +16,7 @@ from fieldfuse.pipelines.work import work
 def export(
     place: Place,
     formats: Annotated[
-        str | None, typer.Option(help="Comma-separated part of points,ply,obj,glb,texture,page,cameras,video.", show_default=False)
+        str | None, typer.Option(help=f"Comma-separated part of {','.join(EXPORTS)}.", show_default=False)
     ] = None,
     *,
     options: Options,

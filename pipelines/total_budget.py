@@ -16,7 +16,7 @@ import psutil
 from fieldfuse.capture.convert import to_convert
 from fieldfuse.capture.prepare import held_out
 from fieldfuse.capture.types import Capture
-from fieldfuse.config import EXPORTS, Settings, settings_dict
+from fieldfuse.config import DEFAULT_EXPORTS, Settings, settings_dict
 from fieldfuse.errors import FieldfuseError
 from fieldfuse.evaluation import budget as model
 from fieldfuse.evaluation.budget_probe import self_test
@@ -78,7 +78,7 @@ class TotalBudget:
         self.speed = speed
         self.work = work_of(capture, settings)
         self.given = fingerprint(settings_dict(settings), self.name, asdict(self.work))
-        self.all_wanted = list(settings.export.formats) == list(EXPORTS)
+        self.all_wanted = list(settings.export.formats) == list(DEFAULT_EXPORTS)
         kept = self._kept(job)
         self._decide_effects(settings, kept)
         for extra in (TEXTURE, PAGE) if self.all_wanted else ():

@@ -345,12 +345,14 @@ class TsdfSettings:
 
 # Files for other programs: "texture" is a mesh with one (textured.glb), "page" the field itself for any browser (field.html), the others
 # are named as they end, or as what they hold.
-EXPORTS = ("points", "ply", "obj", "glb", "texture", "page", "cameras", "video")
+DEFAULT_EXPORTS = ("points", "ply", "obj", "glb", "texture", "page", "cameras", "video")
+MORE_EXPORTS: tuple[str, ...] = ()  # made when they are named
+EXPORTS: tuple[str, ...] = (*DEFAULT_EXPORTS, *MORE_EXPORTS)
 
 
 @dataclass
 class ExportSettings:
-    formats: Annotated[list[str], names_of("format", EXPORTS)] = default(default_factory=lambda: list(EXPORTS))
+    formats: Annotated[list[str], names_of("format", EXPORTS)] = default(default_factory=lambda: list(DEFAULT_EXPORTS))
     mesh_views: NotNegative = 60  # views whose rendered depth is fused into the mesh
     # Long side in pixels, at most, of that depth, and of the pictures, as they were taken, that it is polished by
     mesh_size: Positive = 640

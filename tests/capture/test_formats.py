@@ -217,17 +217,6 @@ def test_views_that_were_cut_out_of_panoramas_pass(room: Path) -> None:
     assert len(check_capture(open_capture(room)).frames) == 8
 
 
-def test_openexr_is_named(room: Path) -> None:
-    path = room / "transforms.json"
-    data = json.loads(path.read_text())
-    for number, entry in enumerate(data["frames"]):
-        (room / f"{number}.exr").write_bytes(b"\x76\x2f\x31\x01" + bytes(100))
-        entry["depth_file_path"] = f"{number}.exr"
-    path.write_text(json.dumps(data))
-    with pytest.raises(InputError, match="OpenEXR, which is not read; write depth as 16-bit PNG"):
-        open_capture(room)
-
-
 def test_how_much_of_a_wide_lens_is_not_used_is_said(room: Path) -> None:
     path = room / "transforms.json"
     data = json.loads(path.read_text())

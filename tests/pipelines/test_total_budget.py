@@ -13,7 +13,7 @@ from typing import Any
 import psutil
 import pytest
 
-from fieldfuse.config import EXPORTS, load_settings
+from fieldfuse.config import DEFAULT_EXPORTS, load_settings
 from fieldfuse.evaluation import budget as model
 from fieldfuse.files import read_json, write_json
 from fieldfuse.pipelines.total_budget import LONGEST_START, TotalBudget
@@ -103,7 +103,7 @@ def fitted(seconds: float, formats: list[str] | None = None, spent: float = 10.0
     """Settings and plan when the fit is decided, `spent` seconds after the start."""
     plan, settings = planned(seconds), load_settings("balanced")
     plan.all_wanted = formats is None
-    settings.export.formats = formats or list(EXPORTS)
+    settings.export.formats = formats or list(DEFAULT_EXPORTS)
     plan._began -= spent
     job = SimpleNamespace(settings=settings, stages=SimpleNamespace(cached={}, records={}))
     with pytest.MonkeyPatch.context() as patch:
@@ -114,15 +114,15 @@ def fitted(seconds: float, formats: list[str] | None = None, spent: float = 10.0
 
 def test_textures_and_the_page_are_left_out_where_they_would_take_the_fits_share() -> None:
     settings, plan = fitted(300)
-    assert settings.export.formats == list(EXPORTS) and plan.choice.texture and plan.choice.page
+    assert settings.export.formats == list(DEFAULT_EXPORTS) and plan.choice.texture and plan.choice.page
     assert plan.choice.fit_seconds > 0.35 * 300
     settings, plan = fitted(50, spent=20)
-    assert settings.export.formats == [name for name in EXPORTS if name != "texture"]
+    assert settings.export.formats == [name for name in DEFAULT_EXPORTS if name != "texture"]
     assert plan.choice.texture is False and plan.choice.page and plan.choice.fit_seconds >= 0.35 * 50
     settings, plan = fitted(50, spent=25)
-    assert settings.export.formats == [name for name in EXPORTS if name not in ("texture", "page")]
+    assert settings.export.formats == [name for name in DEFAULT_EXPORTS if name not in ("texture", "page")]
     settings, plan = fitted(200, spent=140)  # less than its share, and enough
-    assert settings.export.formats == list(EXPORTS) and 30 <= plan.choice.fit_seconds < 0.35 * 200
+    assert settings.export.formats == list(DEFAULT_EXPORTS) and 30 <= plan.choice.fit_seconds < 0.35 * 200
     settings, plan = fitted(50, ["texture", "glb"], spent=25)
     assert settings.export.formats == ["texture", "glb"]  # what was named stays
 

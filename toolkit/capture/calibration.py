@@ -82,7 +82,7 @@ def posed_frame(
     """
     size = image_header(image).size
     intrinsics = fitted(camera, size, str(image))
-    by_header = depth is not None and depth.suffix.lower() not in (".pfm", ".exr")
+    by_header = depth is not None and depth.suffix.lower() != ".pfm"
     depth_size = image_header(depth).size if depth is not None and by_header else size
     own = more.pop("depth_intrinsics", None if depth_size == size else intrinsics)
     confidence = more.pop("confidence", None)

@@ -15,14 +15,13 @@ import numpy as np
 from PIL import Image, UnidentifiedImageError
 from PIL.TiffImagePlugin import ImageFileDirectory_v2
 
-from fieldfuse.capture import heif
+from fieldfuse.capture import exr, heif
 from fieldfuse.capture.colours import png_colours, profile_of
 from fieldfuse.capture.poses import reads_leniently
 from fieldfuse.errors import InputError
 
 MAX_PIXELS = 200_000_000
 PANORAMA = "360° panoramas (equirectangular) are not read; cut each into perspective views first, and give these"
-NOT_EXR = "is OpenEXR, which is not read; write depth as 16-bit PNG in millimetres or as float .npy, and images as PNG or TIFF"
 LYING = 5  # EXIF orientations from here on turn by 90°
 TIFFS = (".tif", ".tiff")
 WIDTH, HEIGHT, BITS, ORIENTATION, MAXIMUM, EXTRA, SAMPLE_FORMAT, PROFILE = 256, 257, 258, 274, 281, 338, 339, 34675  # tags of TIFF 6.0
@@ -64,8 +63,8 @@ def read_header(data: bytes, path: Path) -> Header:
         end = end_of_boxes(io.BytesIO(data), len(data))
         if end is not None and end > len(data):
             raise cut_short
-    if data[:4] == b"\x76\x2f\x31\x01":
-        raise InputError(f"{path} {NOT_EXR}")
+    if data[:4] == exr.MAGIC:
+        return _within_limits(_of_exr(exr.exr_header(data, path)), path)
     header = read_tiff(data)
     try:
         # Pillow's own limit is lower than ours and global; it is lifted for the header only, and ours is applied below.
@@ -84,15 +83,23 @@ def read_header(data: bytes, path: Path) -> Header:
             raise InputError(f"{path} is not an image that can be read; convert it to JPEG or PNG, or remove it") from error
     except Exception as error:  # Pillow's parsers raise many families on damaged headers
         raise InputError(f"the header of the image {path} is damaged; copy it again or remove it") from error
+    if not _complete(data, _within_limits(header, path).format):
+        raise cut_short
+    return header
+
+
+def _within_limits(header: Header, path: Path) -> Header:
     width, height = header.size
     if width * height > MAX_PIXELS:
         most = f"{MAX_PIXELS // 10**6} megapixels"
         raise InputError(f"the image {path} has {width}×{height} pixels, more than the {most} that are read; make it smaller")
     if width < 1 or height < 1:
         raise InputError(f"the image {path} has no pixels ({width}×{height}); remove it")
-    if not _complete(data, header.format):
-        raise cut_short
     return header
+
+
+def _of_exr(found: exr.ExrHeader) -> Header:
+    return Header(*found.size, exr.FORMAT, deep=True, floating=True, alpha="a" in found.names)
 
 
 def image_header(path: Path) -> Header:
@@ -105,9 +112,11 @@ def image_header(path: Path) -> Header:
     if heif.file_is_heif(path):
         heif.register(path)
     suffix = path.suffix.lower()
-    if suffix == ".exr":
-        raise InputError(f"{path} {NOT_EXR}")
+    if suffix == exr.SUFFIX:
+        exr.package(path)
     try:
+        if suffix == exr.SUFFIX:
+            return _of_exr(exr.exr_head(path))
         if suffix == ".npy":
             height, width = np.load(path, mmap_mode="r", allow_pickle=False).shape[:2]
             return Header(int(width), int(height), "NPY")

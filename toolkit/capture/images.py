@@ -14,7 +14,7 @@ import numpy as np
 from PIL import Image
 
 from fieldfuse.camera import Array
-from fieldfuse.capture import heif
+from fieldfuse.capture import exr, heif
 from fieldfuse.capture.archive import MAPS, load_map, read_bytes
 from fieldfuse.capture.colours import to_srgb
 from fieldfuse.capture.headers import LYING, MAX_PIXELS, Header, image_header, orientation_of, read_header, unturned
@@ -93,8 +93,8 @@ def load_depth(frame: Frame, capture: Capture) -> Array:
 
     Stored values are divided by `capture.depth_scale`. 0, negative, NaN and infinite values are missing, so is 65535 in 16-bit images,
     and so is where the frame's confidence is 0. Where the depth camera stands beside the image's, the map is reprojected into that
-    (`depth_reprojection`). Read are 8/16-bit PNG, TIFF and PFM with whole or floating-point numbers, .npy arrays, LZFSE (`archive`), and
-    what `.sens` files hold.
+    (`depth_reprojection`). Read are 8/16-bit PNG, TIFF and PFM with whole or floating-point numbers, OpenEXR, .npy arrays, LZFSE
+    (`archive`), and what `.sens` files hold.
 
     Raises:
         InputError: naming the file, when it is missing, damaged, or not one value a pixel.
@@ -208,6 +208,17 @@ def to_rgba(image: Array, white: int | None = None) -> Array:
     return np.asarray(cv2.cvtColor(image, cv2.COLOR_BGRA2RGBA if image.shape[2] == 4 else cv2.COLOR_BGR2RGB))
 
 
+def as_bgr(image: Array) -> Array:
+    """(H, W, 3) RGB or (H, W, 4) RGBA with premultiplied alpha, floating-point → BGR(A), alpha not premultiplied; (H, W) as it is."""
+    if image.ndim == 2:
+        return image
+    out = np.ascontiguousarray(image[..., [2, 1, 0, *range(3, image.shape[2])]])
+    if out.shape[2] == 4:
+        alpha = np.where(out[..., 3:] > 0, out[..., 3:], np.float32(1))
+        out[..., :3] /= alpha
+    return out
+
+
 def upright(image: Array, orientation: int) -> Array:
     """Apply an EXIF orientation (1 to 8, TIFF 6.0 tag 274) to (H, W, ...) pixels."""
     if orientation in (5, 6, 7, 8):
@@ -221,6 +232,8 @@ def upright(image: Array, orientation: int) -> Array:
 
 def _values(path: Path, frame: Frame) -> Array:
     """What the file of a depth map, or of its confidence, holds."""
+    if path.suffix.lower() == exr.SUFFIX:
+        return exr.read_exr(path, depth=True)
     camera = frame.depth_intrinsics
     if path.suffix.lower() in MAPS and camera is not None:
         return load_map(path, camera.width, camera.height)
@@ -233,6 +246,8 @@ def decode(path: Path) -> tuple[Array, Header]:
     header = read_header(data, path)
     if header.format == heif.FORMAT:
         return heif.decode(data, path), header
+    if header.format == exr.FORMAT:
+        return as_bgr(exr.read_exr(path)), header
     image: Any = None
     try:
         if header.format == "AVIF":  # OpenCV reads more than 8 bits in a range of their own

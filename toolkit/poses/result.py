@@ -13,6 +13,7 @@ from fieldfuse.capture.images import load_depth
 from fieldfuse.capture.poses import checked_pose
 from fieldfuse.capture.types import Capture
 from fieldfuse.errors import InputError, PoseError, first_line
+from fieldfuse.georeference import Georeference
 
 GIVEN, SFM = "given", "sfm"
 FEW, SHARE = 6, 0.1  # images with poses, and their share of all, below which the model is a failed one, or of other images
@@ -38,6 +39,9 @@ class PoseResult:
     warnings: list[str] = field(default_factory=list)
     seconds: dict[str, float] = field(default_factory=dict)  # by step
     metric: bool = False  # one unit is one metre
+    up: tuple[float, float, float] | None = None  # of structure from motion's frame, where it was placed on earth
+    georeference: Georeference | None = None  # where the frame lies on earth; None: not known
+    scaling: dict[str, Any] | None = None  # what gave the unit of length: `source`, `factor`, `error` (relative), `text`; None: nothing did
     agreement: dict[str, Any] | None = None  # of given poses with the images: `share`, `matches`, `pairs`, `reading`; None: not measured
 
     def to_dict(self) -> dict[str, Any]:
@@ -49,6 +53,7 @@ class PoseResult:
             "points": None if self.points is None else _short(self.points, 7),
             "point_errors": None if self.point_errors is None else _short(self.point_errors, 4),
             "seconds": {key: round(float(value), 3) for key, value in self.seconds.items()},
+            "georeference": None if self.georeference is None else self.georeference.to_dict(),
         }
 
     @classmethod
@@ -67,7 +72,7 @@ class PoseResult:
             cameras = [Intrinsics.from_dict(camera) for camera in data["intrinsics"]]
             if len(cameras) != len(names):
                 raise ValueError("as many cameras as names are needed")
-            points, errors = data.get("points"), data.get("point_errors")
+            points, errors, up, place = (data.get(name) for name in ("points", "point_errors", "up", "georeference"))
             return cls(
                 source=str(data["source"]),
                 registered=int(data["registered"]),
@@ -82,6 +87,9 @@ class PoseResult:
                 warnings=[str(text) for text in data["warnings"]],
                 seconds={str(key): float(value) for key, value in data["seconds"].items()},
                 metric=bool(data.get("metric", False)),
+                up=None if up is None else (float(up[0]), float(up[1]), float(up[2])),
+                georeference=None if place is None else Georeference.from_dict(place),
+                scaling=data.get("scaling"),
                 agreement=data.get("agreement"),
             )
         except (KeyError, TypeError, ValueError, OverflowError, AttributeError) as error:
@@ -107,7 +115,7 @@ class PoseResult:
             for name, camera, pose in zip(self.names, self.intrinsics, self.world_from_camera, strict=True)
         ]
         posed = replace(capture.with_frames(frames, *self.warnings), points=self.points)
-        return replace(posed, up=None, metric=self.metric) if self.source == SFM else posed
+        return replace(posed, up=self.up, metric=self.metric) if self.source == SFM else posed
 
     def warned(self, text: str) -> PoseResult:
         """With one more warning."""
