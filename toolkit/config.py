@@ -346,7 +346,7 @@ class TsdfSettings:
 # Files for other programs: "texture" is a mesh with one (textured.glb), "page" the field itself for any browser (field.html), the others
 # are named as they end, or as what they hold.
 DEFAULT_EXPORTS = ("points", "ply", "obj", "glb", "texture", "page", "cameras", "video")
-MORE_EXPORTS: tuple[str, ...] = ()  # made when they are named
+MORE_EXPORTS: tuple[str, ...] = ("splat", "spz")  # made when they are named
 EXPORTS: tuple[str, ...] = (*DEFAULT_EXPORTS, *MORE_EXPORTS)
 
 
@@ -360,6 +360,9 @@ class ExportSettings:
     smooth: Annotated[int, Field(ge=0, le=100)] = 2
     texture_size: Positive = 1280  # long side in pixels, at most, of the pictures that a texture is made of
     video_frames: NotNegative = 90
+    splats: Positive = 300_000  # Gaussians at most, of voxels that training views see
+    sh_degree: Annotated[int, Field(ge=0, le=3)] = 1  # of the spherical harmonics of their colours
+    splat_seconds: Annotated[float, Field(ge=0, lt=10**9)] = 30.0  # of steps on the training images; 0: none
 
 
 @dataclass

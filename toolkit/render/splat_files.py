@@ -1,11 +1,12 @@
 """Gaussian splats on disk: `.ply` as the authors of 3D Gaussian Splatting write it, and Niantic's `.spz`.
 
-`.ply`: float properties x y z, nx ny nz (zero), f_dc_0…2, f_rest_… (all coefficients but the first, red before green before blue), opacity,
-scale_0…2, rot_0…3 (w x y z), in the frame of the cameras that it was fitted to (graphdeco-inria/gaussian-splatting, `GaussianModel.save_ply`).
+`.ply`: float properties x y z, nx ny nz (zero), f_dc_0…2, f_rest_… (all coefficients but the first, red before green before blue),
+opacity, scale_0…2, rot_0…3 (w x y z), in the frame of the cameras that it was fitted to (graphdeco-inria/gaussian-splatting,
+`GaussianModel.save_ply`).
 
-`.spz` (nianticlabs/spz, versions 2 and 3): gzip of a header of 16 bytes and then, of all Gaussians, places as 24-bit fixed point, opacities,
-colours, logarithms of scales, rotations and harmonics as bytes. Its axes are right, up, back where those of the `.ply` are right, down,
-forward, so y and z are turned on the way.
+`.spz` (nianticlabs/spz, versions 2 and 3): gzip of a header of 16 bytes and then, of all Gaussians, places as 24-bit fixed point,
+opacities, colours, logarithms of scales, rotations and harmonics as bytes. Its axes are right, up, back where those of the `.ply` are
+right, down, forward, so y and z are turned on the way.
 """
 
 from __future__ import annotations

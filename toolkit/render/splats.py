@@ -122,7 +122,7 @@ def draw(values: Array, lens: G.Lens) -> Drawn:
     reached = (box[:, 1] - box[:, 0]).astype(np.int64) * (box[:, 3] - box[:, 2])
     ahead = np.concatenate([[0], np.cumsum(reached)])
     if ahead[-1] > MOST_ENTRIES:
-        raise InputError(f"{count} Gaussians cover {ahead[-1]} tiles of this image, too many to draw; they may be in another unit of length")
+        raise InputError(f"{count} Gaussians cover {ahead[-1]} tiles of this image, too many to draw; check their unit of length")
     seen = np.flatnonzero(reached)
     order = seen[np.argsort(flat[seen, G.DEPTH], kind="stable")].astype(np.int32)
     counts = np.zeros(across * down, np.int64)

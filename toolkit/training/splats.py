@@ -1,8 +1,9 @@
 """Gaussian splats of a fitted field: a Gaussian for every voxel that training views see, then steps on the training images.
 
-A Gaussian begins with what rays see of its voxel: the centroid and the covariance of their light, colours in harmonics by least squares over
-the directions of view, and the opacity that rays are stopped with. Steps of Adam on the squared error follow, a view each, in the seconds
-that there are; no Gaussian is added. All of it is in the frame and the colours of the source's images, as other programs show splats.
+A Gaussian begins with what rays see of its voxel: the centroid and the covariance of their light, colours in harmonics by least squares
+over the directions of view, and the opacity that rays are stopped with. Steps of Adam on the squared error follow, a view each, in the
+seconds that there are; no Gaussian is added. All of it is in the frame and the colours of the source's images, as other programs show
+splats.
 """
 
 from __future__ import annotations
@@ -142,6 +143,7 @@ def _gathered(field: Field, targets: Targets, chosen: Tensor, progress: Progress
     space, volume, turn = make_space(field), make_volume(field), targets.input_from_working.rotation
     sums = np.zeros((threads, len(chosen), B.SUMS), np.float32)
     sky = np.zeros((6 * SKY_SIDE**2, 5))
+    limits = np.float32(STOP), np.float32(THRESHOLD)
     pixels = sum(lens.width * lens.height for lens in views.intrinsics)
     stride = max(1, math.ceil(pixels / MOST_RAYS))
     for index in range(len(views)):
@@ -160,7 +162,7 @@ def _gathered(field: Field, targets: Targets, chosen: Tensor, progress: Progress
             own = slices(len(left), threads)
             if thread < len(own):
                 some = [values[own[thread]] for values in given]
-                B.gather_pass(space, volume, slots, *some, np.float32(STOP), np.float32(THRESHOLD), left[own[thread]], sums[thread])
+                B.gather_pass(space, volume, slots, *some, limits, left[own[thread]], sums[thread])
 
         share(part, range(threads), threads)
         cell = _cube_cell(directions.numpy())

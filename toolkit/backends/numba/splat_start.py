@@ -19,15 +19,17 @@ SUMS = 33
 
 @njit(**K.OPTIONS)
 def gather_pass(
-    space: Any, volume: Any, slots: Any, origins: Any, directions: Any, seen: Any, colours: Any, stop: Any, threshold: Any, left: Any, sums: Any
+    space: Any, volume: Any, slots: Any, origins: Any, directions: Any, seen: Any, colours: Any, limits: Any, left: Any, sums: Any
 ) -> None:
     """March rays (B, 3) and add to the sums of the voxels that have a slot.
 
     Args:
         slots: (M · 512,) int32 row of a voxel among sums (S, SUMS) float32; −1: none.
+        limits: float32 stop and threshold, see `march_ray`.
         seen: (B, 3) the rays' directions in the frame of the harmonics; colours: (B, 3) of their pixels.
         left: (B,) light that nothing stops, written.
     """
+    stop, threshold = limits
     samples = Samples(np.empty(K.MOST_KEPT, np.int32), np.empty((K.MOST_KEPT, 8), np.int32), np.empty((K.MOST_KEPT, K.VALUES), np.float32))
     cells, values = samples.cells, samples.values
     result, marks, basis = np.empty(4, np.float32), np.empty(0, np.uint16), np.empty((1, 16), np.float32)

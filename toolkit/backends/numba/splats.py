@@ -1,9 +1,9 @@
 """Gaussian splats, compiled: where they lie in an image, tiles, drawing front to back, and the way back to their parameters.
 
 As published by Kerbl et al. (3D Gaussian Splatting, SIGGRAPH 2023): a Gaussian's covariance in the image is Σ' = J W Σ Wᵀ Jᵀ + 0.3 I, its
-opacity at a pixel α = o exp(−½ dᵀ Σ'⁻¹ d) ≤ 0.99, none below 1/255; tiles of 16×16 pixels, nothing more where less than 1e-4 of the light
-is left. `render/splats.py` says what the parameters are; the tests have a reference in torch. Not part of the gradient: the direction of view,
-which a Gaussian that moves is seen from.
+opacity at a pixel α = o exp(−½ dᵀ Σ'⁻¹ d) ≤ 0.99, none below 1/255; tiles of 16×16 pixels, nothing more where less than 1e-4 of the
+light is left. `render/splats.py` says what the parameters are; the tests have a reference in torch. Not part of the gradient: the direction
+that a Gaussian that moves is seen from.
 
 What all passes do is shared by Gaussians or by tiles, in a fixed order of sums: the result is the same whatever the number of threads.
 """
