@@ -109,14 +109,14 @@ $(VENV)/.python: | system
 
 $(VENV)/.installed: setup.cfg pyproject.toml constraints.txt $(VENV)/.python
 	@echo "Installing Fieldfuse and what it needs into $(VENV)"
-	@$(PIP_INSTALL) --editable '.[exr,geo,h264,heic,record3d,view]'
+	@$(PIP_INSTALL) --editable '.[exr,geo,h264,heic,raw,record3d,view]'
 	@$(FORGET); $(COMPILE) || true
 	@touch $@
 
 # All at once: what `make demo` needs is a part of it.
 $(VENV)/.installed-test: setup.cfg pyproject.toml constraints.txt $(VENV)/.python
 	@echo "Installing Fieldfuse, what it needs and the test tools into $(VENV)"
-	@$(PIP_INSTALL) --editable '.[exr,geo,h264,heic,record3d,test,view]'
+	@$(PIP_INSTALL) --editable '.[exr,geo,h264,heic,raw,record3d,test,view]'
 	@$(FORGET); $(COMPILE) || true
 	@touch $(VENV)/.installed
 	@$(MAKE) --no-print-directory $(VENV)/.installed-lpips $(VENV)/.installed-xfeat

@@ -47,6 +47,7 @@ EXTRAS = (
     ("heic", "pillow-heif", "photos of phones in HEIC (.heic) are not read", "pillow-heif>=1"),
     ("record3d", "imagecodecs", "recordings of Record3D with depth are not read", "imagecodecs>=2024.1"),
     ("exr", "OpenEXR", "OpenEXR images and depth (.exr) are not read", "OpenEXR>=3.5"),
+    ("raw", "rawpy", "camera raw files (.dng, .nef, .cr3, …) are not developed", "rawpy>=0.24"),
     ("geo", "pyproj", "UTM coordinates of captures with GPS are not written", "pyproj>=3.6"),
     ("h264", "av", "videos are written as VP9, slowly, which not all players know", "av>=14"),
 )

@@ -74,15 +74,16 @@ def prepare(job: Job, capture: Capture | None = None) -> Prepared:
 def find_capture(job: Job) -> Capture:
     """Detect what the source is, read it, look at every image once (at those that `choose_frames` writes, then)."""
     path = job.folder / "capture.json"
-    masks = job.settings.capture.masks
+    masks, light = job.settings.capture.masks, job.settings.capture.light
     state = source_state(job.source, job.folder.path)
+    given = [*([masks] if masks != "auto" else []), *([f"light {light}"] if light != "auto" else [])]
     found = job.run(
         Stage(
             "capture",
             make=lambda: steps.read_capture(job.source, job.settings, job.progress),
             save=lambda capture: [_written(path, capture_to_dict(capture))],
             load=lambda: capture_from_dict(read_json(path)),
-            settings=state if masks == "auto" else [state, masks],
+            settings=[state, *given] if given else state,
         )
     )
     return with_unposed(found) if job.settings.poses.source == "sfm" else found

@@ -244,6 +244,8 @@ class CaptureSettings:
     max_frames: Positive = 150  # frames taken from a video
     # auto: black is left out | inverted: white is | off: masks beside the images are not used
     masks: Annotated[str, one_of("auto", "inverted", "off")] = "auto"
+    # What floating-point pictures hold. auto: by format, profile and values | linear: light | display: values for screens (sRGB)
+    light: Annotated[str, one_of("auto", "linear", "display")] = "auto"
 
 
 @dataclass

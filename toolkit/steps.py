@@ -102,9 +102,12 @@ def read_capture(source: Path, settings: Settings, progress: Progress = SILENT) 
     from fieldfuse.capture import open_capture
     from fieldfuse.capture.checks import check_capture
     from fieldfuse.capture.convert import to_convert
+    from fieldfuse.capture.light import LIGHT
     from fieldfuse.poses.check_given import best_fitting
 
     capture = open_capture(source, settings.capture.masks, best_fitting)
+    if settings.capture.light != "auto":
+        capture = replace(capture, extra={**capture.extra, LIGHT: settings.capture.light})
     return capture if to_convert(capture) else check_capture(capture, progress)
 
 

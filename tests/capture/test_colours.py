@@ -151,7 +151,7 @@ def test_a_heif_photo_is_read_and_converted_as_srgb(tmp_path: Path) -> None:
     wanted = expected(picture, P3)
     inner = np.abs(wanted - picture).max(axis=2) > 0
     inner[:, 40:56] = False  # codecs blur an edge
-    written = write_image(path, tmp_path / "written")
+    written = write_image(Frame("", path), tmp_path / "written")
     with Image.open(written) as jpeg:
         assert jpeg.info.get("icc_profile") is None
     for got in (load_image(Frame("a", path)), load_image(Frame("a", written))):

@@ -51,7 +51,7 @@ def test_a_damaged_avif_is_refused_by_name(tmp_path: Path) -> None:
     path = tmp_path / "a" / "02.avif"
     path.write_bytes(path.read_bytes()[:-200])
     with pytest.raises(InputError, match=r"02\.avif is cut short"):
-        read_image(path)
+        read_image(Frame("", path))
 
 
 def test_floating_point_tiff_is_taken_as_0_to_1(tmp_path: Path) -> None:
@@ -124,7 +124,7 @@ def test_a_turned_tiff_is_turned_once_as_a_photo_and_never_beside_poses(orientat
     }[orientation]
     path = tmp_path / "a.tif"
     turned_tiff(path, np.ascontiguousarray(stored), orientation)
-    got, said = read_image(path)
+    got, said = read_image(Frame("", path))
     assert said == orientation == orientation_of(path)
     assert np.array_equal(got, stored)
     header = read_header(read_bytes(path), path)

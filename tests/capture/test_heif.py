@@ -101,7 +101,7 @@ def test_the_small_copy_in_the_file_is_looked_at_where_there_is_one(tmp_path: Pa
     for name, options in (("with", {"thumbnails": [400]}), ("without", {})):
         path = heic(tmp_path / f"{name}.heic", seen, **options)
         data = path.read_bytes()
-        grey = thumbnail(data, read_header(data, path), path)
+        grey = thumbnail(data, read_header(data, path), Frame("", path))
         assert max(grey.shape) == (400 if options else THUMB_SIDE)
         expected = cv2.resize(cv2.cvtColor(seen, cv2.COLOR_RGB2GRAY), grey.shape[::-1], interpolation=cv2.INTER_AREA)
         assert close(grey, expected)

@@ -107,11 +107,11 @@ def test_heic_photos_become_jpegs_that_the_cameras_name(photos: Path, tmp_path: 
     assert (out / named).is_file()
 
 
-def test_camera_raw_is_named(tmp_path: Path, capsys: Capsys) -> None:
+def test_camera_raw_that_nothing_reads_is_named(tmp_path: Path, capsys: Capsys) -> None:
     for index in range(3):
         (tmp_path / f"IMG_{index}.DNG").write_bytes(b"II*\0")
     answer = call(capsys, "info", tmp_path)
-    assert answer.code == 2 and "3 camera raw files (IMG_0.DNG, …)" in answer.sentence() and "JPEG" in answer.sentence()
+    assert answer.code == 2 and "IMG_0.DNG is damaged, or of a camera that LibRaw" in answer.sentence() and "JPEG" in answer.sentence()
 
 
 def test_turning_on_the_spot_is_named(tmp_path: Path, capsys: Capsys) -> None:

@@ -5,6 +5,7 @@ Each must be refused in a sentence, or read, within five seconds; anything else 
 
 from __future__ import annotations
 
+import io
 import json
 import os
 import struct
@@ -47,6 +48,16 @@ def png(width: int, height: int, depth: int, kind: int, data: bytes) -> bytes:
 
     header = struct.pack(">IIBBBBB", width, height, depth, kind, 0, 0, 0)
     return b"\x89PNG\r\n\x1a\n" + chunk(b"IHDR", header) + chunk(b"IDAT", zlib.compress(data, 9)) + chunk(b"IEND", b"")
+
+
+def exr(side: int) -> bytes:
+    """An OpenEXR image of 8 × 8 pixels whose header says `side` × `side`."""
+    import OpenEXR
+
+    file = io.BytesIO()
+    planes = {name: np.zeros((8, 8), np.float32) for name in "RGB"}
+    OpenEXR.File({"compression": OpenEXR.ZIP_COMPRESSION, "type": OpenEXR.scanlineimage}, planes).write(file)
+    return file.getvalue().replace(struct.pack("<4i", 0, 0, 7, 7), struct.pack("<4i", 0, 0, side - 1, side - 1))
 
 
 def field_of_many_channels(path: Path) -> None:
@@ -138,6 +149,7 @@ def bombs(place: Path) -> dict[str, Callable[[], Any]]:
     (place / "huge.png").write_bytes(png(14_000, 14_000, 16, 6, bytes(1000)))
     (place / "flat.png").write_bytes(png(14_000, 14_000, 16, 6, bytes(40_000_000)))
     (place / "side.png").write_bytes(png(2**31 - 1, 1, 8, 0, b""))
+    (place / "huge.exr").write_bytes(exr(50_000))
     (place / "sparse.json").open("wb").truncate(2**36)
     (place / "deep.json").write_text("[" * 10_000_000)
     LAYOUTS["tum"][1](place / "lists")
@@ -169,6 +181,7 @@ def bombs(place: Path) -> dict[str, Callable[[], Any]]:
         "a picture of 1.6 GB that holds 40 MB": lambda: load_image(Frame("a", place / "flat.png")),
         "a picture two thousand million pixels wide": lambda: load_image(Frame("a", place / "side.png")),
         "a folder of three pictures of 169 megapixels in nothing": lambda: check_capture(open_capture(folder)),
+        "an OpenEXR picture of 30 GB in a kilobyte": lambda: load_image(Frame("a", place / "huge.exr")),
         "64 GB of JSON in a sparse file": lambda: read_json(place / "sparse.json"),
         "64 GB of zeros in a list of images": lambda: open_capture(place / "lists"),
         "ten million brackets": lambda: read_json(place / "deep.json"),

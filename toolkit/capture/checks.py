@@ -17,8 +17,9 @@ from fieldfuse.capture import heif
 from fieldfuse.capture.archive import read_bytes
 from fieldfuse.capture.calibration import fitted
 from fieldfuse.capture.depth_checks import check_depth
-from fieldfuse.capture.headers import LYING, PANORAMA, TIFFS, Header, is_panorama, read_header, unturned
-from fieldfuse.capture.images import decode, read_image, spread, turns_by_exif, upright
+from fieldfuse.capture.headers import LYING, PANORAMA, Header, is_panorama, read_header, unturned
+from fieldfuse.capture.images import read_image, spread, turns_by_exif, upright
+from fieldfuse.capture.light import with_white
 from fieldfuse.capture.listing import counted, natural_key, some_of, unique_names
 from fieldfuse.capture.photos import size_from_exif
 from fieldfuse.capture.types import Capture, Frame
@@ -34,10 +35,6 @@ DARK = 40  # grey level that 95% of a dark image's pixels stay under
 BLOWN = 253  # grey level from which a pixel counts as saturated
 BLURRED = 0.25  # of the usual sharpness of the capture
 CUT_OFF = 0.1  # share of an image that is not used, from which on there is a remark
-FLOAT_WHITES = (255, 1023, 4095, 16383, 65535)  # that floating-point values may be meant for
-WHOLE, BRIGHT, EVERY = 4.0, 90, 7  # they are where their 90th percentile, of every 7th that is not black, is as large as this
-ABOVE_ONE = 1e-3  # by which values may exceed 1 before that is worth a word
-FEWER_BITS = (1023, 4095, 16383)  # largest values of sensors that store 10, 12 and 14 bits in 16
 LOOKED_AT_SHAPES, SAME_SHAPE = 5, 0.05  # images whose EXIF is looked at; difference of width to height that rounding and lenses explain
 NOTICE = 0.1  # share of images from which a warning is worth reading
 # Saved again (a quarter of the size, JPEG of quality 30), images differ by up to 1.3 grey levels on average and 14 at most, at 48 × 48;
@@ -77,7 +74,7 @@ def check_capture(capture: Capture, progress: Progress = SILENT) -> Capture:
         return capture
     if len(frames) == 1:
         raise InputError(f"{capture.root} holds only one image; take at least 20 from different places")
-    capture = floats_to_white(scaled_to_white(capture, progress), progress)
+    capture = with_white(capture, progress)
     capture, headers, looks, exact = _look_at_all(capture, progress)
     capture = with_usable_depth(capture)
     blank = [look for look in looks if look.deviation < FLAT]
@@ -104,63 +101,6 @@ def check_capture(capture: Capture, progress: Progress = SILENT) -> Capture:
     extra = {**capture.extra, "sizes": {f"{width}x{height}": number for (width, height), number in sizes.most_common()}}
     new = [warning for warning in warnings if warning not in capture.warnings]
     return replace(capture, extra=extra, warnings=(*capture.warnings, *new))
-
-
-def scaled_to_white(capture: Capture, progress: Progress = SILENT) -> Capture:
-    """The capture with `Frame.white` where its images use 10, 12 or 14 of 16 bits, by the files' headers or their largest value."""
-    deep = [frame for frame in capture.frames if frame.image.suffix.lower() in (*TIFFS, ".png") and frame.video_index is None]
-    most, by_header = 0, True
-    for number, frame in enumerate(deep):
-        progress.check()
-        try:
-            header = read_header(read_bytes(frame.image), frame.image)
-            if header.deep and header.white is not None:
-                most = max(most, header.white)
-            elif header.deep:
-                image, by_header = decode(frame.image)[0], False
-                colours = image[..., :3] if image.ndim == 3 else image
-                most = max(most, int(colours.max()) if image.dtype == np.uint16 else 0)
-        except InputError:
-            continue  # reported where images are looked at
-        if not header.deep or most > FEWER_BITS[-1]:
-            return capture
-        progress.update(number, len(deep), frame.name)
-    if not deep or len(deep) < len(capture.frames) or most <= 255:
-        return capture
-    white = next(bits for bits in FEWER_BITS if most <= bits)
-    why = "by the files' headers" if by_header else f"as no value exceeds {most}"
-    remark = f"the images use {white.bit_length()} of 16 bits, {why}; {white} is taken for white"
-    return capture.with_frames([replace(frame, white=white) for frame in capture.frames], remark)
-
-
-def floats_to_white(capture: Capture, progress: Progress = SILENT) -> Capture:
-    """The capture with `Frame.white` where its floating-point images hold whole numbers (up to 255 or 65535) instead of 0 to 1, and with a
-    remark on these, or on values beyond 1 that are cut off."""
-    found: dict[str, tuple[float, float]] = {}  # the largest value, and a high percentile of what is not black
-    for frame in capture.frames:
-        if frame.image.suffix.lower() not in TIFFS or frame.video_index is not None:
-            continue
-        progress.check()
-        try:
-            if not read_header(read_bytes(frame.image), frame.image).floating:
-                break  # of a capture, all are of one kind
-            image = decode(frame.image)[0]
-        except InputError:
-            continue  # reported where images are looked at
-        values = image[..., :3][np.isfinite(image[..., :3])] if image.ndim == 3 else image[np.isfinite(image)]
-        some = values[values > 0][::EVERY]
-        found[frame.name] = (float(values.max()), float(np.percentile(some, BRIGHT))) if some.size else (0.0, 0.0)
-    most = max((largest for largest, _ in found.values()), default=0.0)
-    beyond = sum(largest > 1 + ABOVE_ONE for largest, _ in found.values())
-    if not beyond:
-        return capture
-    if np.median([bright for _, bright in found.values()]) < WHOLE or most > FLOAT_WHITES[-1]:
-        many = counted(beyond, "floating-point image has", "floating-point images have")
-        remark = f"{many} values up to {most:.4g}; 1 is taken for white, and what is above it is cut off"
-        return capture.with_frames(capture.frames, remark)
-    white = next(value for value in FLOAT_WHITES if most <= value)
-    remark = f"the floating-point images have values up to {most:.4g}; {white} is taken for white"
-    return capture.with_frames([replace(frame, white=white) if frame.name in found else frame for frame in capture.frames], remark)
 
 
 def _look_at_all(capture: Capture, progress: Progress) -> tuple[Capture, dict[Path, Header], list[Look], dict[Path, Path]]:
@@ -204,7 +144,7 @@ def _look_at_all(capture: Capture, progress: Progress) -> tuple[Capture, dict[Pa
 
 
 def _look(frame: Frame, data: bytes, header: Header, exif: bool) -> Look:
-    thumb = thumbnail(data, header, frame.image, frame.white)
+    thumb = thumbnail(data, header, frame)
     grey = upright(thumb, header.orientation if exif and header.format != heif.FORMAT else 1).astype(np.float32)
     deviation = float(grey.std())
     # Divided by the contrast, so that a dim image does not pass for a blurred one.
@@ -213,8 +153,9 @@ def _look(frame: Frame, data: bytes, header: Header, exif: bool) -> Look:
     return Look(frame, tiny, deviation, sharpness, float(np.quantile(grey, 0.95)), float((thumb >= BLOWN).mean()))
 
 
-def thumbnail(data: bytes, header: Header, path: Path, white: int | None = None) -> Array:
+def thumbnail(data: bytes, header: Header, frame: Frame) -> Array:
     """A small grey image (h, w) uint8, long side about `THUMB_SIDE`; JPEG is decoded at an eighth, a quarter or half its size."""
+    path = frame.image
     ratio = max(header.width, header.height) / THUMB_SIDE
     reduced = ((8, cv2.IMREAD_REDUCED_GRAYSCALE_8), (4, cv2.IMREAD_REDUCED_GRAYSCALE_4), (2, cv2.IMREAD_REDUCED_GRAYSCALE_2))
     flags = next((flag for factor, flag in reduced if ratio >= factor and header.format in ("JPEG", "MPO")), cv2.IMREAD_GRAYSCALE)
@@ -223,7 +164,7 @@ def thumbnail(data: bytes, header: Header, path: Path, white: int | None = None)
         if header.format == heif.FORMAT:
             grey = heif.small(data, THUMB_SIDE, path)
         elif header.deep or header.format == "AVIF":
-            grey = np.asarray(cv2.cvtColor(read_image(path, white)[0][..., :3], cv2.COLOR_RGB2GRAY))
+            grey = np.asarray(cv2.cvtColor(read_image(frame, small=True)[0][..., :3], cv2.COLOR_RGB2GRAY))
         else:
             grey = cv2.imdecode(np.frombuffer(unturned(data), np.uint8), flags | cv2.IMREAD_IGNORE_ORIENTATION)
     except cv2.error:

@@ -70,6 +70,20 @@ def _conversion(profile: bytes) -> Callable[[Array], None] | None:
     return convert if int(np.abs(after.astype(int) - before).max()) > SAME else None
 
 
+def is_linear(profile: bytes | None) -> bool | None:
+    """Whether an ICC profile's curve for green is a straight line; None without a profile or such a curve (ICC.1:2022, 10.6 and 10.18)."""
+    if profile is None or not 132 <= len(profile) <= MOST_BYTES:
+        return None
+    for index in range(min(struct.unpack_from(">I", profile, 128)[0], 100, (len(profile) - 132) // 12)):
+        name, at, size = struct.unpack_from(">4sII", profile, 132 + 12 * index)
+        if name == b"gTRC" and size >= 12 and at + size <= len(profile):
+            kind, count = struct.unpack_from(">4s4xI", profile, at)
+            if kind == b"curv":
+                return count == 0 or (count == 1 and size >= 14 and profile[at + 12 : at + 14] == b"\1\0")
+            return kind == b"para" and size >= 16 and profile[at + 8 : at + 10] == b"\0\0" and profile[at + 12 : at + 16] == b"\0\1\0\0"
+    return None
+
+
 def png_colours(data: bytes) -> bytes | None:
     """The ICC profile of a PNG's cICP, which goes before its other colours; None without one, or where it is sRGB."""
     at = 8

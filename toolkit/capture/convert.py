@@ -1,8 +1,8 @@
 """Images written once as JPEG, and cameras for the pixels as files hold them.
 
-HEIF takes ten times as long to decode as JPEG, which every stage would do again, and few other programs read it; for photos that EXIF
-mirrors no camera could be exported. Both are written anew. Photos are turned upright by EXIF before anything is done with them; other
-programs, and captures that come with poses, take the pixels as they are stored.
+HEIF takes ten times as long to decode as JPEG, and camera raw a hundred times, which every stage would do again, and few other programs
+read them; for photos that EXIF mirrors no camera could be exported. All of these are written anew. Photos are turned upright by EXIF before
+anything is done with them; other programs, and captures that come with poses, take the pixels as they are stored.
 """
 
 from __future__ import annotations
@@ -10,6 +10,7 @@ from __future__ import annotations
 import math
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import cv2
 import numpy as np
@@ -19,8 +20,10 @@ from fieldfuse.capture.checks import check_capture
 from fieldfuse.capture.headers import image_header, orientation_of
 from fieldfuse.capture.heif import file_is_heif
 from fieldfuse.capture.images import read_image, turns_by_exif, upright
+from fieldfuse.capture.light import with_white
 from fieldfuse.capture.listing import counted, unique_names
-from fieldfuse.capture.types import Capture
+from fieldfuse.capture.raw import is_raw
+from fieldfuse.capture.types import Capture, Frame
 from fieldfuse.errors import InputError, OutputError, first_line
 from fieldfuse.files import atomic_path, fingerprint, read_json, write_json
 from fieldfuse.progress import SILENT, Progress
@@ -36,12 +39,13 @@ MIRRORED = (2, 4, 5, 7)  # orientations that no camera has: rotations do not mir
 
 
 def to_convert(capture: Capture) -> list[int]:
-    """Indices of the frames whose images are HEIF, or photos that are to be mirrored."""
+    """Indices of the frames whose images are HEIF or camera raw, or photos that are to be mirrored."""
     exif = turns_by_exif(capture)
     return [
         i
         for i, frame in enumerate(capture.frames)
-        if frame.video_index is None and (file_is_heif(frame.image) or (exif and orientation_of(frame.image) in MIRRORED))
+        if frame.video_index is None
+        and (file_is_heif(frame.image) or is_raw(frame.image) or (exif and orientation_of(frame.image) in MIRRORED))
     ]
 
 
@@ -63,16 +67,17 @@ def convert_images(capture: Capture, out: Path, threads: int, progress: Progress
         OutputError: an image cannot be written.
     """
     indices = to_convert(capture)
+    capture = with_white(capture, progress)
     folder = Path(out) / "frames"
     names = unique_names([capture.frames[i].image for i in indices])
-    done = _still_good(folder, {name: fingerprint(VERSION, capture.frames[i].image) for name, i in zip(names, indices, strict=True)})
+    done = _still_good(folder, {name: _state(capture.frames[i]) for name, i in zip(names, indices, strict=True)})
     finished = 0
 
     def convert(one: tuple[str, int]) -> tuple[int, Path]:
         nonlocal finished
         name, index = one
         progress.check()
-        path = done.get(name) or write_image(capture.frames[index].image, folder / name)
+        path = done.get(name) or write_image(capture.frames[index], folder / name)
         finished += 1
         progress.update(finished, len(indices), f"{finished} of {counted(len(indices), 'image')} as JPEG")
         return index, path.resolve()
@@ -80,13 +85,20 @@ def convert_images(capture: Capture, out: Path, threads: int, progress: Progress
     largest = max((math.prod(image_header(capture.frames[i].image).size) for i in indices), default=1)
     at_once = max(1, min(threads, MOST_AT_ONCE, int(PIXELS_AT_ONCE / largest)))
     written = dict(share(convert, list(zip(names, indices, strict=True)), at_once))
-    frames = [replace(frame, image=written.get(i, frame.image)) for i, frame in enumerate(capture.frames)]
+    as_shown: dict[str, Any] = {"white": None, "linear": None, "balance": None}
+    frames = [replace(frame, image=written[i], **as_shown) if i in written else frame for i, frame in enumerate(capture.frames)]
     return check_capture(replace(capture.with_frames(frames), extra={**capture.extra, CONVERTED: len(indices)}), progress)
 
 
-def write_image(source: Path, target: Path) -> Path:
-    """Write an image, upright, as `target` with `.jpg` added, or `.png` where it has alpha, and return that path."""
-    image = upright(*read_image(source))
+def _state(frame: Frame) -> str:
+    """What distinguishes the image that is written of a frame from others."""
+    shown = [frame.white, frame.linear, frame.balance]
+    return fingerprint(VERSION, frame.image, *(shown if any(value is not None for value in shown) else []))
+
+
+def write_image(frame: Frame, target: Path) -> Path:
+    """Write a frame's image, upright, as `target` with `.jpg` added, or `.png` where it has alpha, and return that path."""
+    source, image = frame.image, upright(*read_image(frame))
     alpha = image.shape[2] == 4
     path = target.with_name(f"{target.name}.{'png' if alpha else 'jpg'}")
     order = cv2.COLOR_RGBA2BGRA if alpha else cv2.COLOR_RGB2BGR

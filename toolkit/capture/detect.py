@@ -23,7 +23,7 @@ from fieldfuse.capture.archive import SUFFIXES as ARCHIVES
 from fieldfuse.capture.blender import looks_like_blender, read_blender
 from fieldfuse.capture.colmap import candidate_models, has_images, looks_like_colmap, owners, read_colmap
 from fieldfuse.capture.dtu import looks_like_dtu, read_dtu
-from fieldfuse.capture.listing import IMAGES, counted, images_in, natural_key, require_folder, some_of
+from fieldfuse.capture.listing import IMAGES, images_in, natural_key, require_folder, some_of
 from fieldfuse.capture.llff import looks_like_llff, read_llff
 from fieldfuse.capture.photos import looks_like_photos, photo_files, read_photos
 from fieldfuse.capture.polycam import looks_like_polycam, read_polycam
@@ -47,7 +47,6 @@ from fieldfuse.files import require_utf8
 
 FILMS = (*VIDEO_SUFFIXES, RECORD3D)
 DEEPEST, MOST_FOLDERS = 3, 200  # where captures are looked for that are not in the given folder itself
-CAMERA_RAW = (".dng", ".cr2", ".cr3", ".nef", ".arw", ".raf", ".orf", ".rw2", ".pef", ".srw")
 
 
 def _colmap_without_llff(path: Path) -> bool:
@@ -157,7 +156,7 @@ def _read_file(path: Path) -> Capture:
     suffix = path.suffix.lower()
     if suffix == ".json":
         return read_blender(path.parent) if path.name.startswith("transforms_") else read_transforms(path)
-    if suffix in (*IMAGES, *CAMERA_RAW):
+    if suffix in IMAGES:
         raise InputError(f"{path} is one image, and one cannot show depth; give the folder that holds all of them")
     if suffix in ARCHIVES:  # only Record3D's recordings are read from a zip file, since the app itself writes it so
         if suffix != RECORD3D and not holds_record3d(path):
@@ -180,11 +179,6 @@ def _read_folder(folder: Path) -> Capture:
         return video.with_frames(video.frames, *cover)
     if videos:
         raise InputError(f"{folder} holds {len(videos)} videos; give one of them, for instance {videos[0]}")
-    raw = images_in(folder, CAMERA_RAW)
-    if raw:
-        names = some_of([file.name for file in raw], 1)
-        what = f"{folder} holds {counted(len(raw), 'camera raw file')} ({names}), which cannot be read"
-        raise InputError(f"{what}; develop them to JPEG, all in the same way")
     below = _read_below(folder)
     if below is not None:
         return below

@@ -15,7 +15,7 @@ import numpy as np
 from PIL import Image, UnidentifiedImageError
 from PIL.TiffImagePlugin import ImageFileDirectory_v2
 
-from fieldfuse.capture import exr, heif
+from fieldfuse.capture import exr, heif, raw
 from fieldfuse.capture.colours import png_colours, profile_of
 from fieldfuse.capture.poses import reads_leniently
 from fieldfuse.errors import InputError
@@ -30,7 +30,7 @@ _pillow_limit = threading.Lock()
 
 @dataclass(frozen=True)
 class Header:
-    """An image as stored, before any EXIF turn (HEIF: as it is seen)."""
+    """An image as stored, before any EXIF turn (HEIF, camera raw: as it is seen)."""
 
     width: int
     height: int
@@ -57,6 +57,8 @@ def read_header(data: bytes, path: Path) -> Header:
         InputError: not an image, more than `MAX_PIXELS` pixels, the file ends before the image does, or pillow-heif is not installed.
     """
     cut_short = InputError(f"the image {path} is cut short (the file ends before the image does); copy it again or remove it")
+    if raw.is_raw(path):
+        return _within_limits(Header(*raw.raw_size(data, path), raw.FORMAT, deep=True), path)
     if heif.is_heif(data):
         heif.register(path)
     if heif.is_heif(data) or data[4:12] in (b"ftypavif", b"ftypavis"):
@@ -114,9 +116,13 @@ def image_header(path: Path) -> Header:
     suffix = path.suffix.lower()
     if suffix == exr.SUFFIX:
         exr.package(path)
+    if raw.is_raw(path):
+        raw.package(path)
     try:
         if suffix == exr.SUFFIX:
             return _of_exr(exr.exr_head(path))
+        if raw.is_raw(path):
+            return Header(*raw.raw_size(path.read_bytes(), path), raw.FORMAT, deep=True)
         if suffix == ".npy":
             height, width = np.load(path, mmap_mode="r", allow_pickle=False).shape[:2]
             return Header(int(width), int(height), "NPY")
@@ -151,9 +157,9 @@ def is_panorama(data: bytes, header: Header, posed: bool) -> bool:
 
 
 def orientation_of(path: Path) -> int:
-    """The EXIF orientation of an image file, with only its header read. 1 also for HEIF, which is decoded upright, and for a file that
-    cannot be read, which is reported where it is decoded."""
-    if heif.file_is_heif(path):
+    """The EXIF orientation of an image file, with only its header read. 1 also for HEIF and camera raw, which are decoded upright, and for
+    a file that cannot be read, which is reported where it is decoded."""
+    if heif.file_is_heif(path) or raw.is_raw(path):
         return 1
     try:
         if path.suffix.lower() in TIFFS and (tiff := read_tiff(path.read_bytes())) is not None:

@@ -14,7 +14,7 @@ import numpy as np
 from PIL import Image
 
 from fieldfuse.camera import Array
-from fieldfuse.capture import exr, heif
+from fieldfuse.capture import exr, heif, raw
 from fieldfuse.capture.archive import MAPS, load_map, read_bytes
 from fieldfuse.capture.colours import to_srgb
 from fieldfuse.capture.headers import LYING, MAX_PIXELS, Header, image_header, orientation_of, read_header, unturned
@@ -22,9 +22,11 @@ from fieldfuse.capture.sens import is_sens, sens_depth
 from fieldfuse.capture.types import Capture, Frame
 from fieldfuse.capture.video import iterate_video
 from fieldfuse.errors import InputError
+from fieldfuse.tone import stored
 
 EXIF_TURNS = "exif_turns"  # in `Capture.extra`: the cameras are those of images that are turned by EXIF
 LOSSY = ("JPEG", "MPO", "WEBP", heif.FORMAT)  # formats whose black and white come out as greys
+LINEAR = (exr.FORMAT, raw.FORMAT)  # formats whose channels hold linear light
 FEW_LEVELS = 32  # grey levels of a mask up to which they are labels, not soft edges
 HEADERS, IMAGES = 100, 5  # looked at at most, evenly spread: decoding all of a large capture would take minutes
 T = TypeVar("T")
@@ -47,9 +49,10 @@ def turns_by_exif(capture: Capture) -> bool:
 def load_image(frame: Frame, *, exif: bool = False) -> Array:
     """The frame's image, (H, W, 3) or with alpha (H, W, 4), uint8 RGB(A), alpha not premultiplied.
 
-    Grey images become RGB; 16-bit ones are rounded to 8 bits; floating-point ones are taken as 0 to 1. Colours are sRGB's, whatever
-    profile the file has. A mask that is alpha (`mask_is_alpha`) becomes the image's. With `exif` the EXIF orientation is applied (see
-    `turns_by_exif`), without it the pixels stay as stored.
+    Grey images become RGB; 16-bit ones are rounded to 8 bits; floating-point ones are taken as 0 to 1. Linear light (OpenEXR, camera raw,
+    what `light.with_white` finds) gets sRGB's curve, up to the frame's white. Colours are sRGB's, whatever profile the file has. A mask
+    that is alpha (`mask_is_alpha`) becomes the image's. With `exif` the EXIF orientation is applied (see `turns_by_exif`), without it the
+    pixels stay as stored.
 
     Raises:
         InputError: naming the file, when it is missing, no image, cut short or too large.
@@ -58,18 +61,20 @@ def load_image(frame: Frame, *, exif: bool = False) -> Array:
         for _, image in iterate_video(frame.image, {frame.video_index}, as_stored=frame.as_stored):
             return image
         raise InputError(f"frame {frame.video_index} of the video {frame.image} cannot be decoded; the file may be damaged")
-    stored, orientation = read_image(frame.image, frame.white)
-    image = upright(stored, orientation if exif else 1)
+    as_stored, orientation = read_image(frame)
+    image = upright(as_stored, orientation if exif else 1)
     mask = load_mask(frame, exif=exif) if frame.mask_is_alpha else None
     if mask is None or image.shape[2] == 4:
         return image
     return np.dstack([image, cv2.resize(mask.astype(np.uint8) * 255, image.shape[1::-1], interpolation=cv2.INTER_LINEAR)])
 
 
-def read_image(path: Path, white: int | None = None) -> tuple[Array, int]:
-    """The image in the file `path` as `load_image` has it, pixels as stored, and the EXIF orientation; `white` as `Frame.white`."""
-    image, header = decode(path)
-    return to_srgb(to_rgba(image, white), header.profile), 1 if header.format == heif.FORMAT else header.orientation
+def read_image(frame: Frame, *, small: bool = False) -> tuple[Array, int]:
+    """The image file of a frame as `load_image` has it, pixels as stored, and its EXIF orientation; `small` as `decode`."""
+    image, header = decode(frame.image, frame.balance, small=small)
+    linear = header.format in LINEAR if frame.linear is None else frame.linear
+    shown = to_rgba(image, frame.white, linear=linear)
+    return shown if linear else to_srgb(shown, header.profile), 1 if header.format == heif.FORMAT else header.orientation
 
 
 def cut_out(frames: Sequence[Frame]) -> bool:
@@ -145,8 +150,8 @@ def load_mask(frame: Frame, *, exif: bool = False) -> Array | None:
     """
     if frame.mask is None:
         return None
-    stored, header = decode(frame.mask)
-    mask = _white(stored, header.format in LOSSY)
+    decoded, header = decode(frame.mask)
+    mask = _white(decoded, header.format in LOSSY)
     if exif:
         mask = upright(mask, 1 if header.format == heif.FORMAT else header.orientation)
         orientation = orientation_of(frame.image)
@@ -186,21 +191,25 @@ def _white(mask: Array, lossy: bool) -> Array:
     return np.asarray(grey > grey.max() / 2 if soft else grey > 0)
 
 
-def to_rgba(image: Array, white: int | None = None) -> Array:
+def to_rgba(image: Array, white: float | None = None, *, linear: bool = False) -> Array:
     """A decoded image of any depth and number of channels (BGR order) → (H, W, 3) or (H, W, 4) uint8 RGB(A).
 
     Args:
         white: the value of 16-bit or floating-point channels that becomes 255; None: 65535, or 1. Alpha of 16 bits always uses all.
+        linear: such channels hold linear light, which gets sRGB's curve.
     """
-    if image.dtype == np.uint16:
+    if image.dtype == np.uint16 and not linear:
         alpha = image[..., 3:] if white is not None and image.ndim == 3 and image.shape[2] == 4 else None
         image = cv2.convertScaleAbs(image, alpha=255 / (white or 65535))
         if alpha is not None:
             image[..., 3:] = alpha >> 8
     elif image.dtype != np.uint8:
-        top = white or 1
-        finite = np.nan_to_num(image.astype(np.float32), nan=0.0, posinf=top, neginf=0.0)
-        image = np.round(np.clip(finite / np.float32(top), 0, 1) * 255).astype(np.uint8)
+        most = 65535.0 if image.dtype == np.uint16 else 1.0
+        top = white or most
+        finite = np.nan_to_num(image.astype(np.float32), nan=0.0, posinf=max(top, most), neginf=0.0)
+        image = stored(finite / top) if linear else np.round(np.clip(finite / top, 0, 1) * 255).astype(np.uint8)
+        if linear and image.ndim == 3 and image.shape[2] == 4:
+            image[..., 3] = np.round(np.clip(finite[..., 3] / most, 0, 1) * 255)
     if image.ndim == 3 and image.shape[2] == 1:
         image = image[:, :, 0]
     if image.ndim == 2:
@@ -240,12 +249,18 @@ def _values(path: Path, frame: Frame) -> Array:
     return decode(path)[0]
 
 
-def decode(path: Path) -> tuple[Array, Header]:
-    """The pixels as stored (OpenCV's channel order and depth; of HEIF as they are seen), and the file's header."""
+def decode(path: Path, balance: raw.Balance | None = None, *, small: bool = False) -> tuple[Array, Header]:
+    """The pixels as stored (OpenCV's channel order and depth; of HEIF and camera raw as they are seen), and the file's header.
+
+    Args:
+        balance: white balance of camera raw. small: half of its size will do.
+    """
     data = read_bytes(path)
     header = read_header(data, path)
     if header.format == heif.FORMAT:
         return heif.decode(data, path), header
+    if header.format == raw.FORMAT:
+        return raw.develop(data, path, balance, small=small), header
     if header.format == exr.FORMAT:
         return as_bgr(exr.read_exr(path)), header
     image: Any = None

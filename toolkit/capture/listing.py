@@ -12,13 +12,14 @@ import numpy as np
 
 from fieldfuse import files
 from fieldfuse.camera import Array
-from fieldfuse.capture import heif
+from fieldfuse.capture import exr, heif, raw
 from fieldfuse.capture.images import cut_out
 from fieldfuse.capture.poses import unread_frames
 from fieldfuse.capture.types import Capture, Frame
 from fieldfuse.errors import InputError, first_line
 
-IMAGES = (".jpg", ".jpeg", ".png", ".webp", ".bmp", ".tif", ".tiff", ".avif", *heif.SUFFIXES)
+ORDINARY = (".jpg", ".jpeg", ".png", ".webp", ".bmp", ".tif", ".tiff", ".avif", *heif.SUFFIXES)
+IMAGES = (*ORDINARY, exr.SUFFIX, *raw.SUFFIXES)
 MAX_TEXT_BYTES = 64 * 2**20
 
 
@@ -74,10 +75,14 @@ def is_file(path: Path) -> bool:
 
 
 def images_in(folder: Path, suffixes: Sequence[str] = IMAGES) -> list[Path]:
-    """Images directly in `folder`, in natural order; an absent folder holds none. Hidden files are left out."""
+    """Images directly in `folder`, in natural order; an absent folder holds none. Hidden files are left out, and OpenEXR and camera raw
+    beside ordinary images, since those are depth or the same photos."""
     if not folder.is_dir():
         return []
     found = [path for path in folder.iterdir() if path.suffix.lower() in suffixes and not path.name.startswith(".") and path.is_file()]
+    if suffixes is IMAGES:
+        groups = ([path for path in found if path.suffix.lower() in group] for group in (ORDINARY, (exr.SUFFIX,), raw.SUFFIXES))
+        found = next((group for group in groups if group), [])
     return sorted(found, key=lambda path: natural_key(path.name))
 
 

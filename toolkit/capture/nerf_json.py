@@ -295,7 +295,7 @@ def unmirrored(poses: Sequence[Array], images: Sequence[Path], cameras: Sequence
 def _features(path: Path, camera: Intrinsics) -> tuple[Array, Array]:
     """Rays (N, 3) in camera axes with z = 1, and descriptors (N, 128); none of an image that cannot be read."""
     try:
-        grey = cv2.cvtColor(np.ascontiguousarray(read_image(path)[0][..., :3]), cv2.COLOR_RGB2GRAY)
+        grey = cv2.cvtColor(np.ascontiguousarray(read_image(Frame("", path))[0][..., :3]), cv2.COLOR_RGB2GRAY)
     except InputError:
         return np.zeros((0, 3)), np.zeros((0, 128), np.float32)
     factor = min(1.0, SIDE / max(grey.shape))

@@ -18,6 +18,7 @@ from typing import Any
 
 from PIL import Image
 
+from fieldfuse.capture import raw
 from fieldfuse.capture.colmap import holds_model
 from fieldfuse.capture.headers import image_header
 from fieldfuse.capture.heif import SUFFIXES as HEIF_SUFFIXES
@@ -101,7 +102,7 @@ def read_photos(path: Path | str) -> Capture:
     root = require_folder(path)
     images, remarks = _of_one_capture(root, photo_folders(root))
     if not images:
-        raise InputError(f"no photo (jpg, heic, png, webp, bmp, tif) was found in {root}; give the folder that holds them")
+        raise InputError(f"no photo (jpg, heic, png, webp, avif, bmp, tif, exr, raw) was found in {root}; give the folder that holds them")
     for image in images:
         require_utf8(image)
     # Phones and programs leave a .heic beside what they convert it to: a photo twice would be fitted and held out at once.
@@ -204,6 +205,8 @@ def _exif(path: Path) -> dict[int, Any]:
     try:
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")  # Pillow remarks on size and on every oddity of EXIF
+            if raw.is_raw(path):
+                return dict(raw.exif_of(path).get_ifd(EXIF_FOLDER))
             with Image.open(path) as image:
                 return dict(image.getexif().get_ifd(EXIF_FOLDER))
     except Exception:  # Pillow raises many families

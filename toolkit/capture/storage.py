@@ -94,7 +94,12 @@ def _frame(data: dict[str, Any]) -> Frame:
     values |= {key: Intrinsics.from_dict(given[key]).checked("the stored capture") for key in CAMERAS if key in given}
     values |= {key: np.array(given[key], dtype=np.float64).reshape(4, 4) for key in POSES if key in given}
     values |= {key: bool(given.get(key, False)) for key in FLAGS}
-    return Frame(name=str(data["name"]), white=int(given["white"]) if "white" in given else None, **values)
+    values |= {"white": float(given["white"])} if "white" in given else {}
+    values |= {"linear": bool(given["linear"])} if "linear" in given else {}
+    if "balance" in given:
+        red, green, blue = (float(value) for value in given["balance"])
+        values["balance"] = (red, green, blue)
+    return Frame(name=str(data["name"]), **values)
 
 
 # ------------------------------------------------------------------------------------------------ views

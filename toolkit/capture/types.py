@@ -31,7 +31,9 @@ class Frame:
     focal_prior: float | None = None  # pixels, from EXIF, when intrinsics are unknown
     as_stored: bool = False  # of a video: its frames are not turned, and those count too that its edit list hides
     confidence: Path | None = None  # image of the depth map's size; 0 = the sensor does not trust this depth
-    white: int | None = None  # largest value of the image's channels, where they use fewer bits than they are stored in; None: all bits
+    white: float | None = None  # value of the image's channels that is shown as white; None: the largest that they can have, or 1
+    linear: bool | None = None  # the channels hold linear light, not sRGB's curve; None: as is usual for the file's format
+    balance: tuple[float, float, float] | None = None  # white balance with which a camera raw file is developed; None: the camera's
     depth_pose: Array | None = None  # (4, 4) image's camera from the depth camera, units of the poses; None: both at the same place
     mask_excludes: bool = False  # the mask is the other way round: what is not 0 is not used
     mask_is_alpha: bool = False  # nothing is there where the mask is 0, as the image shows: it is cut out

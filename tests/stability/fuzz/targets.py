@@ -27,6 +27,7 @@ from fieldfuse.poses.result import given_poses
 from fieldfuse.render.field import Field
 from fieldfuse.render.rays import render_rays
 from fieldfuse.tone import Tone
+from tests.capture.dng import mosaic, write_dng
 from tests.capture.layouts import LAYOUTS, write_record3d, zipped
 from tests.capture.made import eyes, render, save_picture
 from tests.stability.fuzz.given import (
@@ -156,6 +157,25 @@ def make_photos(root: Path) -> None:
     small.save(root / "h.heic", quality=80, exif=tags.tobytes())
 
 
+def make_exr(root: Path) -> None:
+    """OpenEXR with and without alpha, in half and full precision, by several ways to compress."""
+    import OpenEXR
+
+    root.mkdir(parents=True, exist_ok=True)
+    ways = (OpenEXR.ZIP_COMPRESSION, OpenEXR.PIZ_COMPRESSION, OpenEXR.DWAA_COMPRESSION)
+    for name, eye, way, kind in zip("abc", eyes(), ways, (np.float16, np.float32, np.float16), strict=False):
+        colours = render(eye, LAYOUTS_CAMERA)[0].astype(kind) / kind(255)
+        planes = {channel: np.ascontiguousarray(colours[..., index]) for index, channel in enumerate("RGB")}
+        planes |= {"A": np.ones((60, 80), kind)} if name == "b" else {}
+        OpenEXR.File({"compression": way, "type": OpenEXR.scanlineimage}, planes).write(str(root / f"{name}.exr"))
+
+
+def make_raw(root: Path) -> None:
+    root.mkdir(parents=True, exist_ok=True)
+    for name, eye in zip("abc", eyes(), strict=False):
+        write_dng(root / f"{name}.dng", mosaic(render(eye, LAYOUTS_CAMERA)[0].astype(np.float32) / 255))
+
+
 def read_photo_folder(root: Path, number: int) -> None:
     capture = contained(open_capture(root), root)
     for frame in capture.frames:
@@ -267,6 +287,8 @@ TARGETS: tuple[Target, ...] = (
     Target("recording", ("a.r3d",), make_recording, read_capture, 1.0),
     Target("extras", ("transforms.json", "mask1.png", "depth2.npy", "points.ply"), make_extras, read_capture, 2.0),
     Target("photos", PHOTOS, make_photos, read_photo_folder, 3.0),
+    Target("openexr", ("a.exr", "b.exr", "c.exr"), make_exr, read_photo_folder, 1.0),
+    Target("camera raw", ("a.dng", "b.dng", "c.dng"), make_raw, read_photo_folder, 1.0),
     Target("videos", ("a.avi", "b.mp4", "c.webm"), make_videos, read_one_video, 1.5),
     Target("run json", RUN_FILES, make_runs, read_json_files, 2.0),
     Target("results", RESULT_FILES, make_results, read_results, 2.5),
