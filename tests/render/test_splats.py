@@ -12,33 +12,16 @@ import pytest
 import torch
 from numpy.typing import NDArray
 
-from fieldfuse.camera import Intrinsics
 from fieldfuse.render import splats as S
 from fieldfuse.render.splat_files import TURNED, open_splats, save_splats, to_spz
 from tests.render import splats_reference
-
-CAMERA = Intrinsics(45, 37, 40.0, 42.0, 21.0, 19.5)
-POSE = np.array([[0.936, -0.275, 0.218, 0.1], [0.289, 0.956, -0.036, -0.2], [-0.199, 0.097, 0.975, 0.05], [0, 0, 0, 1]])
-
-
-def some(count: int, degree: int, seed: int = 0) -> NDArray[np.float32]:
-    """Gaussians before the camera, a few of them beside the image or behind it, some large, some nearly opaque."""
-    rng, columns = np.random.default_rng(seed), 11 + 3 * (degree + 1) ** 2
-    values = rng.normal(0, 0.3, (count, columns))
-    depth = rng.uniform(1, 3, count)
-    depth[: count // 10] *= -1
-    at = np.stack([rng.uniform(-0.7, 0.7, count) * depth, rng.uniform(-0.6, 0.6, count) * depth, depth], 1)
-    values[:, :3] = at @ POSE[:3, :3].T + POSE[:3, 3]
-    values[:, 3:6] = rng.uniform(np.log(0.01), np.log(0.25), (count, 3))
-    values[:, 6:10] = rng.normal(size=(count, 4))
-    values[:, 10] = rng.uniform(-4, 5, count)
-    return values.astype(np.float32)
+from tests.render.made import SPLAT_CAMERA, SPLAT_POSE, some_splats
 
 
 def test_a_drawing_is_the_references() -> None:
-    values = some(120, 3)
-    drawn = S.draw(values, S.make_lens(CAMERA, POSE, 0.0))
-    image, light = splats_reference.draw(torch.from_numpy(values).double(), CAMERA, POSE)
+    values = some_splats(120, 3)
+    drawn = S.draw(values, S.make_lens(SPLAT_CAMERA, SPLAT_POSE, 0.0))
+    image, light = splats_reference.draw(torch.from_numpy(values).double(), SPLAT_CAMERA, SPLAT_POSE)
     np.testing.assert_allclose(drawn.image[..., :3], image.numpy(), atol=2e-4)
     np.testing.assert_allclose(drawn.image[..., 3], light.numpy(), atol=2e-4)
     assert light.min() < 0.1 and light.max() > 0.5
@@ -46,13 +29,13 @@ def test_a_drawing_is_the_references() -> None:
 
 @pytest.mark.parametrize("degree", [0, 1, 3])
 def test_gradients_are_the_references(degree: int) -> None:
-    values = some(60, degree, seed=degree + 1)
-    lens = S.make_lens(CAMERA, POSE, 0.0)
+    values = some_splats(60, degree, seed=degree + 1)
+    lens = S.make_lens(SPLAT_CAMERA, SPLAT_POSE, 0.0)
     drawn = S.draw(values, lens)
     rng = np.random.default_rng(5)
-    pull, behind = rng.normal(size=(CAMERA.height, CAMERA.width, 3)), np.array([0.3, 0.5, 0.9])
+    pull, behind = rng.normal(size=(SPLAT_CAMERA.height, SPLAT_CAMERA.width, 3)), np.array([0.3, 0.5, 0.9])
     exact = torch.from_numpy(values).double().requires_grad_(True)
-    image, light = splats_reference.draw(exact, CAMERA, POSE)
+    image, light = splats_reference.draw(exact, SPLAT_CAMERA, SPLAT_POSE)
     ((image + light[..., None] * torch.from_numpy(behind)) * torch.from_numpy(pull)).sum().backward()  # type: ignore[no-untyped-call]
     colour = drawn.image[..., :3] + drawn.image[..., 3:4] * behind
     slope = np.concatenate([pull, (pull * colour).sum(2, keepdims=True)], 2).astype(np.float32)
@@ -84,7 +67,7 @@ def as_columns(values: NDArray[np.float32]) -> dict[str, NDArray[np.float32]]:
 @pytest.mark.parametrize("degree", range(4))
 def test_a_ply_is_what_another_library_reads(degree: int, tmp_path: Path) -> None:
     plyfile = pytest.importorskip("plyfile", reason="plyfile reads the file independently: pip install plyfile")
-    values = some(50, degree)
+    values = some_splats(50, degree)
     save_splats(tmp_path / "splat.ply", S.Splats(values, np.zeros(3)))
     vertex = plyfile.PlyData.read(str(tmp_path / "splat.ply"))["vertex"]
     for name, column in as_columns(values).items():
@@ -99,21 +82,21 @@ def test_a_ply_is_what_another_library_reads(degree: int, tmp_path: Path) -> Non
 @pytest.mark.parametrize("degree", range(4))
 def test_what_another_library_writes_is_read(degree: int, tmp_path: Path) -> None:
     plyfile = pytest.importorskip("plyfile", reason="plyfile writes the file independently: pip install plyfile")
-    values, path = some(50, degree, seed=9), tmp_path / "theirs.ply"
+    values, path = some_splats(50, degree, seed=9), tmp_path / "theirs.ply"
     columns = as_columns(values)
     rows = np.zeros(50, [(name, "f4") for name in reversed(columns)])  # in another order, and with a column of their own
     for name, column in columns.items():
         rows[name] = column
     element = plyfile.PlyElement.describe(rows, "vertex")
     plyfile.PlyData([element], text=degree == 0, byte_order=">" if degree == 1 else "<").write(str(path))
-    image = S.Splats(values, np.zeros(3)).render(CAMERA, POSE).rgb
-    np.testing.assert_allclose(open_splats(path).render(CAMERA, POSE).rgb, image, atol=1e-5)
+    image = S.Splats(values, np.zeros(3)).render(SPLAT_CAMERA, SPLAT_POSE).rgb
+    np.testing.assert_allclose(open_splats(path).render(SPLAT_CAMERA, SPLAT_POSE).rgb, image, atol=1e-5)
 
 
 @pytest.mark.parametrize("degree", range(4))
 def test_a_spz_is_what_another_library_reads(degree: int, tmp_path: Path) -> None:
     gsply = pytest.importorskip("gsply", reason="gsply reads the file independently: pip install gsply")
-    values = some(60, degree, seed=3)
+    values = some_splats(60, degree, seed=3)
     save_splats(tmp_path / "splat.spz", S.Splats(values, np.zeros(3)))
     theirs, ours = gsply.read_spz(str(tmp_path / "splat.spz")), open_splats(tmp_path / "splat.spz").values
     # The library leaves the file's axes as they are: right, up, back.
@@ -135,17 +118,17 @@ def test_a_spz_is_what_another_library_reads(degree: int, tmp_path: Path) -> Non
 def test_the_formats_axes_are_those_that_splat_transform_reads(degree: int, tmp_path: Path) -> None:
     if shutil.which("splat-transform") is None:
         pytest.skip("splat-transform reads the file with Niantic's own code: npm install -g @playcanvas/splat-transform")
-    values = some(60, degree, seed=4)
+    values = some_splats(60, degree, seed=4)
     save_splats(tmp_path / "splat.spz", S.Splats(values, np.zeros(3)))
     subprocess.run(["splat-transform", "-q", tmp_path / "splat.spz", tmp_path / "back.ply"], check=True, capture_output=True, timeout=60)
-    ours, theirs = (open_splats(tmp_path / name).render(CAMERA, POSE).rgb for name in ("splat.spz", "back.ply"))
+    ours, theirs = (open_splats(tmp_path / name).render(SPLAT_CAMERA, SPLAT_POSE).rgb for name in ("splat.spz", "back.ply"))
     np.testing.assert_allclose(theirs, ours, atol=2e-3)
 
 
 def test_version_2_of_spz_is_read(tmp_path: Path) -> None:
     """Its rotations are x, y and z in a byte each; w, which is not negative, follows."""
     gsply = pytest.importorskip("gsply", reason="gsply reads the file independently: pip install gsply")
-    values, path = some(60, 1, seed=6), tmp_path / "2.spz"
+    values, path = some_splats(60, 1, seed=6), tmp_path / "2.spz"
     body = bytearray(gzip.decompress(to_spz(S.Splats(values, np.zeros(3)))))
     body[4] = 2
     turn = np.rint(as_unit(values)[:, 1:] * [127.5, -127.5, -127.5] + 127.5).astype(np.uint8).tobytes()

@@ -32,6 +32,7 @@ from fieldfuse.render.sky import sky_colours
 from fieldfuse.render.splats import PARTS, SH_0, Drawn, Splats, draw, make_lens, pulled
 from fieldfuse.threads import share, slices
 from fieldfuse.tone import exposed
+from fieldfuse.training.fit import Clock
 from fieldfuse.volume.topology import BLOCK, VOXELS
 
 Tensor = torch.Tensor
@@ -135,14 +136,13 @@ def start(field: Field, targets: Targets, settings: SplatSettings, progress: Pro
 
 
 def _gathered(field: Field, targets: Targets, chosen: Tensor, progress: Progress) -> tuple[Array, Array]:
-    """(S, SUMS) sums of the voxels `chosen`, and (6 · SKY_SIDE², 5) sums of what rays see behind all of them: light, light times
-    direction, number of rays."""
+    """(S, SUMS) sums of the voxels `chosen`, and (6 · SKY_SIDE²,) mean light that rays see behind all of them, NaN where none look."""
     views, threads = targets.views, torch.get_num_threads()
     slots = np.full(len(field.occupied), -1, np.int32)
     slots[chosen.numpy()] = np.arange(len(chosen), dtype=np.int32)
     space, volume, turn = make_space(field), make_volume(field), targets.input_from_working.rotation
     sums = np.zeros((threads, len(chosen), B.SUMS), np.float32)
-    sky = np.zeros((6 * SKY_SIDE**2, 5))
+    sky = np.zeros((2, 6 * SKY_SIDE**2))
     limits = np.float32(STOP), np.float32(THRESHOLD)
     pixels = sum(lens.width * lens.height for lens in views.intrinsics)
     stride = max(1, math.ceil(pixels / MOST_RAYS))
@@ -166,9 +166,8 @@ def _gathered(field: Field, targets: Targets, chosen: Tensor, progress: Progress
 
         share(part, range(threads), threads)
         cell = _cube_cell(directions.numpy())
-        for column, value in enumerate((left, *(left[:, None] * directions.numpy()).T, np.ones(len(left)))):
-            sky[:, column] += np.bincount(cell, value, len(sky))
-    return sums.sum(0) if threads > 1 else sums[0], sky
+        sky += np.bincount(cell, left, sky.shape[1]), np.bincount(cell, minlength=sky.shape[1])
+    return sums.sum(0) if threads > 1 else sums[0], np.divide(*sky, out=np.full(sky.shape[1], np.nan), where=sky[1] > 0)
 
 
 def _gaussians(field: Field, cells: Tensor, sums: Array, back: Similarity) -> tuple[Array, Array]:
@@ -243,19 +242,30 @@ def _cube_cell(directions: Array) -> Array:
     return (face * SKY_SIDE + at[:, 0]) * SKY_SIDE + at[:, 1]
 
 
+def _cube_directions() -> Array:
+    """(6 · SKY_SIDE², 3) unit vectors to the middles of the cells."""
+    face, row, column = np.unravel_index(np.arange(6 * SKY_SIDE**2), (6, SKY_SIDE, SKY_SIDE))
+    out, all_of = np.zeros((len(face), 3)), np.arange(len(face))
+    out[all_of, face // 2] = np.where(face % 2, 1, -1)
+    for step, at in ((1, row), (2, column)):
+        out[all_of, (face // 2 + step) % 3] = np.tan(((at + 0.5) / SKY_SIDE - 0.5) * np.pi / 2)
+    return out / np.linalg.norm(out, axis=1, keepdims=True)
+
+
 def _sky_gaussians(field: Field, targets: Targets, sky: Array, origin: Array) -> Array:
-    """(S, 11 + 12) large, flat Gaussians far behind all others where training views see through them, in the background's colours."""
-    kept = sky[:, 0] > SKY_LIGHT * np.maximum(sky[:, 4], 1)
-    mean = sky[kept, 1:4]
-    if not len(mean):
+    """(S, 11 + 12) large Gaussians far behind all others in the background's colours: where training views see through them, and, if they
+    do anywhere, in all directions in which none looks."""
+    open_to = sky > SKY_LIGHT
+    kept = open_to | np.isnan(sky) if open_to.any() else open_to
+    direction = _cube_directions()[kept]
+    if not len(direction):
         return np.zeros((0, G.HARMONICS + 12), np.float32)
-    mean /= np.linalg.norm(mean, axis=1, keepdims=True)
-    unit = torch.from_numpy(mean.astype(np.float32))
-    colour = np.tile(field.background.numpy(), (len(mean), 1)) if field.sky is None else sky_colours(field.sky, unit).numpy()
+    unit = torch.from_numpy(direction.astype(np.float32))
+    colour = np.tile(field.background.numpy(), (len(unit), 1)) if field.sky is None else sky_colours(field.sky, unit).numpy()
     back = targets.input_from_working
-    direction = back.directions(mean)
+    direction = back.directions(direction)
     far = SKY_FAR * max(np.linalg.norm(targets.poses[:, :3, 3] - origin, axis=1).max(), 2 * field.space.half * back.scale)
-    out = np.zeros((len(mean), G.HARMONICS + 12), np.float32)
+    out = np.zeros((len(direction), G.HARMONICS + 12), np.float32)
     out[:, :3] = far * direction
     out[:, G.SCALE : G.SCALE + 3] = np.log(far * (math.pi / 2) / SKY_SIDE * 0.6)
     out[:, G.ROTATION], out[:, G.OPACITY] = 1, 4
@@ -274,10 +284,10 @@ def polished(
     state = G.Moments(np.zeros_like(values), np.zeros_like(values), np.zeros(len(values), np.uint16))
     sizes = np.exp(values[:, G.SCALE : G.SCALE + 3].mean(1))
     rates = _rates(values.shape[1])
-    rng, begin, done = np.random.default_rng(settings.seed), ticks(), 0.0
+    rng, clock, done = np.random.default_rng(settings.seed), Clock(ticks), 0.0
     while done < 1 and not progress.stopping():
         for index in rng.permutation(len(targets)):
-            done = (ticks() - begin) / max(settings.seconds, 1e-9)
+            done = clock.seconds() / max(settings.seconds, 1e-9)
             if done >= 1 or progress.stopping():
                 break
             progress.update(done, 1, "steps")
