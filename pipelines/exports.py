@@ -25,7 +25,7 @@ from fieldfuse.pipelines.job import Job
 from fieldfuse.pipelines.pictures import NAME, PAGE, camera_of, orbit_cameras, pictures, put_page
 from fieldfuse.pipelines.prepare import Prepared
 from fieldfuse.pipelines.schemas import read_export_facts
-from fieldfuse.pipelines.splats import SPLAT_FILES, SPZ, splats_or_why_not
+from fieldfuse.pipelines.splats import SPLAT_FILES, SPZ, remove_old_splats, splats_or_why_not
 from fieldfuse.pipelines.stages import CollectingStage
 from fieldfuse.pipelines.surfaces import put_points
 from fieldfuse.pipelines.textured import TEXTURED, put_textured
@@ -102,7 +102,8 @@ def export_results(job: Job, ready: Prepared, fitted: Fitted, wish: Wish) -> dic
             facts["mesh"] = before["mesh"]
         if old is not None and not fits:
             made = {file.relative_to(job.folder.path).as_posix() for file in exported.files}
-            gone = sorted({Path(name).name for name in set(old.outputs) - made if name.startswith("exports/")} - {path.name})
+            before_it = {Path(name).name for name in set(old.outputs) - made if name.startswith("exports/")} - {path.name}
+            gone = sorted(before_it | (remove_old_splats(job) if splats is None else set()))
             facts["notes"] += [REMOVED.format(", ".join(gone), job.folder.path)] if gone else []
         return facts
 

@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from fieldfuse.errors import InputError
+from fieldfuse.files import remove
 from fieldfuse.pipelines.rendered import Pictures
 from fieldfuse.pipelines.stages import Stage, StoredStage
 from fieldfuse.pipelines.surfaces import pictures_stage, render_views
@@ -33,6 +34,17 @@ def splats_or_why_not(job: Job, ready: Prepared, fitted: Fitted, formats: Iterab
         return make_splats(job, ready, fitted) if set(formats) & set(SPLAT_FILES) else None
     except InputError as error:
         return f"the splats were left out: {error}"
+
+
+def remove_old_splats(job: Job) -> set[str]:
+    """Remove what is of an earlier field; the names of the files."""
+    record = job.stages.record(SPLATS)
+    if record is None or job.stages.usable(SPLATS):
+        return set()
+    there = {path.name: path for path in map(job.folder.path.joinpath, record.outputs) if path.is_file()}
+    for path in there.values():
+        remove(path)
+    return set(there)
 
 
 def make_splats(job: Job, ready: Prepared, fitted: Fitted) -> Splats:
