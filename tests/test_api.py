@@ -178,7 +178,7 @@ def test_importing_loads_nothing_heavy_and_all_names_are_there() -> None:
 
 def test_splats_show_what_the_field_shows(scene: ff.Scene, fitted: ff.Field, tmp_path: Path) -> None:
     with steady():
-        splats = fitted.to_splats(splat_seconds=0.5)
+        splats = fitted.to_splats(splat_seconds=1)
     ours, theirs = ff.evaluate(splats, scene), ff.evaluate(fitted, scene)
     assert ours.psnr is not None and theirs.psnr is not None and ours.psnr > theirs.psnr - 2
     camera = scene.test.cameras[0]

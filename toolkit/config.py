@@ -362,7 +362,7 @@ class ExportSettings:
     smooth: Annotated[int, Field(ge=0, le=100)] = 2
     texture_size: Positive = 1280  # long side in pixels, at most, of the pictures that a texture is made of
     video_frames: NotNegative = 90
-    splats: Positive = 300_000  # Gaussians at most, of voxels that training views see
+    splats: Positive = 150_000  # Gaussians at most, of voxels that training views see
     sh_degree: Annotated[int, Field(ge=0, le=3)] = 1  # of the spherical harmonics of their colours
     splat_seconds: Annotated[float, Field(ge=0, lt=10**9)] = 30.0  # of steps on the training images; 0: none
 

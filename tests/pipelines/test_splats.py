@@ -42,7 +42,7 @@ def test_they_stay_as_they_are_until_the_field_changes(run: Path) -> None:
         assert said("evaluate", run, "--threads", "1").code == 0
         assert (run / "exports" / "splat.ply").stat().st_mtime_ns == before
         assert read_json(run / "report.json")["evaluation"]["splats"]["gaussians"] > 100
-        assert said("finetune", run, "--budget", "0.5", "--threads", "1").code == 0
+        assert said("finetune", run, "--budget", "1", "--threads", "1").code == 0
     data = read_json(run / "report.json")
     assert "splats" not in data["evaluation"]  # those of the earlier field are not scored as this one's
     assert not (run / "exports" / "splat.ply").exists() and any("splat.ply" in warning for warning in data["warnings"])

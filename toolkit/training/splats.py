@@ -12,6 +12,7 @@ import math
 import time
 from collections.abc import Callable
 from dataclasses import dataclass, replace
+from typing import NamedTuple
 
 import cv2
 import numpy as np
@@ -37,18 +38,19 @@ from fieldfuse.volume.topology import BLOCK, VOXELS
 
 Tensor = torch.Tensor
 SEEN = 0.05  # largest share of a pixel's light below which a voxel becomes no Gaussian
+MOST_VOXELS = 2_000_000
+MOST_SIDE = 2**20  # of a lattice, voxels
 MOST_RAYS = 2_000_000  # that voxels' sums are made of; pixels are skipped evenly
-SPREAD = 1.8  # standard deviations of a Gaussian over those of the light in its voxel: neighbours overlap
-OVERLAP = 2.0  # Gaussians beside each other that a ray meets instead of one voxel
+SPREAD = 2.2  # standard deviations of a Gaussian over those of the light in its voxel: neighbours overlap
+OVERLAP = 1.0  # Gaussians beside each other that a ray meets instead of one voxel
 LONGEST = 4.0  # standard deviation over the second longest: contracted space is stretched along the rays
 RIDGE = 0.1  # of the light that a voxel was seen with: holds back what directions of view do not say
-LEAST_OPACITY, MOST_OPACITY = 0.02, 0.95
-SKY_SIDE = 24  # cells along a side of the cube that what shines through is sorted into
-SKY_LIGHT = 0.02  # mean light of a cell's rays below which nothing is put there
+LEAST_OPACITY, MOST_OPACITY = 0.02, 0.98
+SKY_SIDE = 24  # Gaussians along a side of the cube behind all others
 SKY_FAR = 20.0  # distance over that of the farthest camera or the region's corner, from the region's centre
 SMALL = 0.35  # of the seconds that images of half the size are looked at
 # Of Adam, a step: places in sizes of the Gaussian, logarithms of scales, rotations, opacity, constant and other harmonics.
-RATES = {"place": 0.05, "scale": 0.015, "rotation": 0.01, "opacity": 0.05, "colour": 0.015, "harmonics": 0.0015}
+RATES = {"place": 0.1, "scale": 0.03, "rotation": 0.02, "opacity": 0.05, "colour": 0.04, "harmonics": 0.004}
 FINAL = 0.1  # of the rates, at the end
 
 
@@ -56,7 +58,7 @@ FINAL = 0.1  # of the rates, at the end
 class SplatSettings:
     """`most` Gaussians, harmonics up to `degree`, `seconds` for the steps."""
 
-    most: int = 300_000
+    most: int = 150_000
     degree: int = 1
     seconds: float = 30.0
     seed: int = 0
@@ -117,32 +119,32 @@ class Targets:
 
 
 def start(field: Field, targets: Targets, settings: SplatSettings, progress: Progress = SILENT) -> Splats:
-    """A Gaussian for each of the voxels that hold most of some pixel's light."""
+    """A Gaussian for each of the voxels that hold some of a pixel's light; where these are too many, for eight voxels together."""
     views = targets.views
     weight = seen_weights(field, views.intrinsics, views.world_from_camera, progress)
     chosen = (weight > SEEN).nonzero().view(-1)
-    if len(chosen) > settings.most:
-        chosen = chosen[weight[chosen].topk(settings.most, sorted=False).indices].sort().values
-    sums, sky = _gathered(field, targets, chosen, progress)
+    if len(chosen) > MOST_VOXELS:
+        chosen = chosen[weight[chosen].topk(MOST_VOXELS, sorted=False).indices].sort().values
+    sums = _gathered(field, targets, chosen, progress)
     kept = sums[:, B.WEIGHT] > THRESHOLD
     if not kept.any():
         raise InputError("the training views see nothing of the field, so there is nothing to make splats of; fit it for longer")
-    values, origin = _gaussians(field, chosen[torch.from_numpy(kept)], sums[kept], targets.input_from_working)
+    cells = _at_most(settings.most, _cells(field, chosen[torch.from_numpy(kept)], torch.from_numpy(sums[kept])))
+    values, origin = _gaussians(field, cells, targets.input_from_working)
     if views.background is None:
-        values = np.concatenate([values, _sky_gaussians(field, targets, sky, origin)])
+        values = np.concatenate([values, _sky_gaussians(field, targets, origin)])
     wanted = G.HARMONICS + 3 * (settings.degree + 1) ** 2
     values = np.pad(values, ((0, 0), (0, max(0, wanted - values.shape[1]))))[:, :wanted]
     return Splats(np.ascontiguousarray(values, np.float32), origin)
 
 
-def _gathered(field: Field, targets: Targets, chosen: Tensor, progress: Progress) -> tuple[Array, Array]:
-    """(S, SUMS) sums of the voxels `chosen`, and (6 · SKY_SIDE²,) mean light that rays see behind all of them, NaN where none look."""
+def _gathered(field: Field, targets: Targets, chosen: Tensor, progress: Progress) -> Array:
+    """(S, SUMS) sums of the voxels `chosen`."""
     views, threads = targets.views, torch.get_num_threads()
     slots = np.full(len(field.occupied), -1, np.int32)
     slots[chosen.numpy()] = np.arange(len(chosen), dtype=np.int32)
     space, volume, turn = make_space(field), make_volume(field), targets.input_from_working.rotation
     sums = np.zeros((threads, len(chosen), B.SUMS), np.float32)
-    sky = np.zeros((2, 6 * SKY_SIDE**2))
     limits = np.float32(STOP), np.float32(THRESHOLD)
     pixels = sum(lens.width * lens.height for lens in views.intrinsics)
     stride = max(1, math.ceil(pixels / MOST_RAYS))
@@ -156,23 +158,69 @@ def _gathered(field: Field, targets: Targets, chosen: Tensor, progress: Progress
         origins, directions, _ = rays(lens, views.world_from_camera[index], pixel_grid(lens.width, lens.height)[picked])
         seen = np.ascontiguousarray(directions.numpy() @ turn.T.astype(np.float32))
         given = (origins.numpy(), directions.numpy(), seen, image.reshape(-1, 3)[picked])
-        left = np.empty(len(picked), np.float32)
 
-        def part(thread: int, given: tuple[Array, ...] = given, left: Array = left) -> None:
-            own = slices(len(left), threads)
+        def part(thread: int, given: tuple[Array, ...] = given) -> None:
+            own = slices(len(given[0]), threads)
             if thread < len(own):
-                some = [values[own[thread]] for values in given]
-                B.gather_pass(space, volume, slots, *some, limits, left[own[thread]], sums[thread])
+                B.gather_pass(space, volume, slots, *(values[own[thread]] for values in given), limits, sums[thread])
 
         share(part, range(threads), threads)
-        cell = _cube_cell(directions.numpy())
-        sky += np.bincount(cell, left, sky.shape[1]), np.bincount(cell, minlength=sky.shape[1])
-    return sums.sum(0) if threads > 1 else sums[0], np.divide(*sky, out=np.full(sky.shape[1], np.nan), where=sky[1] > 0)
+    return np.asarray(sums.sum(0) if threads > 1 else sums[0])
 
 
-def _gaussians(field: Field, cells: Tensor, sums: Array, back: Similarity) -> tuple[Array, Array]:
-    """(S, 11 + 12) parameters of the voxels' Gaussians in the input's frame, and the origin (3,) of their centres."""
-    space, given = field.space, torch.from_numpy(sums)
+class _Cells(NamedTuple):
+    """Cubes of voxels and what rays see of them."""
+
+    corner: Tensor  # (S, 3) int64 lattice coordinates of the lowest voxel
+    side: Tensor  # (S,) int64 voxels
+    sums: Tensor  # (S, SUMS) places from the corner, in voxels
+
+    def take(self, which: Tensor) -> _Cells:
+        return _Cells(*(values[which] for values in self))
+
+
+def _cells(field: Field, voxels: Tensor, sums: Tensor) -> _Cells:
+    block, local = voxels.div(VOXELS, rounding_mode="floor"), voxels % VOXELS
+    corner = field.topology.keys[block].long() * BLOCK + torch.stack([local % BLOCK, local // BLOCK % BLOCK, local // BLOCK**2], 1)
+    return _Cells(corner, torch.ones(len(corner), dtype=torch.int64), sums)
+
+
+def _at_most(most: int, cells: _Cells) -> _Cells:
+    """No more than so many: eight become one where that loses least of what colours differ by, weighted by the light they are seen with."""
+    while len(cells.side) > most:
+        side = 2 * int(cells.side.max())
+        parent = cells.corner.div(side, rounding_mode="floor")
+        known, of = torch.unique((parent[:, 2] * MOST_SIDE + parent[:, 1]) * MOST_SIDE + parent[:, 0], return_inverse=True)
+        count = torch.bincount(of)
+        light, colour = cells.sums[:, B.WEIGHT], cells.sums[:, B.COLOURS : B.COLOURS + 3]
+        apart = torch.zeros(len(known)).index_add_(0, of, colour.square().sum(1) / light)
+        together = torch.zeros(len(known), 3).index_add_(0, of, colour).square().sum(1) / torch.zeros(len(known)).index_add_(0, of, light)
+        order = (apart - together).argsort(descending=True)
+        split = torch.zeros(len(known), dtype=torch.bool)
+        split[order[: int((len(known) + torch.cumsum(count[order] - 1, 0) <= most).sum())]] = True
+        stays, goes = split[of], (~split)[of]
+        corner = torch.zeros(len(known), 3, dtype=torch.int64).index_copy_(0, of, parent * side)
+        sums = torch.zeros(len(known), B.SUMS).index_add_(0, of[goes], _moved(cells.take(goes), corner[of[goes]]))
+        joined = _Cells(corner[~split], torch.full((int((~split).sum()),), side), sums[~split])
+        cells = _Cells(*(torch.cat(both) for both in zip(cells.take(stays), joined, strict=True)))
+    return cells
+
+
+def _moved(cells: _Cells, corner: Tensor) -> Tensor:
+    """The cells' sums with places counted from other corners."""
+    out, shift = cells.sums.clone(), (cells.corner - corner).float()
+    light, place = out[:, B.WEIGHT, None], cells.sums[:, B.PLACE : B.PLACE + 3]
+    out[:, B.PLACE : B.PLACE + 3] += light * shift
+    row, column = torch.triu_indices(3, 3)
+    out[:, B.SQUARE : B.SQUARE + 6] += (
+        place[:, row] * shift[:, column] + shift[:, row] * place[:, column] + light * shift[:, row] * shift[:, column]
+    )
+    return out
+
+
+def _gaussians(field: Field, cells: _Cells, back: Similarity) -> tuple[Array, Array]:
+    """(S, 11 + 12) parameters of the cells' Gaussians in the input's frame, and the origin (3,) of their centres."""
+    space, given = field.space, cells.sums
     light = given[:, B.WEIGHT]
     place = given[:, B.PLACE : B.PLACE + 3] / light[:, None]
     second = given[:, B.SQUARE : B.SQUARE + 6] / light[:, None]
@@ -180,9 +228,7 @@ def _gaussians(field: Field, cells: Tensor, sums: Array, back: Similarity) -> tu
     spread = torch.stack([xx, xy, xz, xy, yy, yz, xz, yz, zz], 1).view(-1, 3, 3) - place[:, :, None] * place[:, None]
     # Of few rays the spread is too small; an evenly filled voxel counts as one more.
     spread = (light[:, None, None] * spread + torch.eye(3) / 12) / (1 + light[:, None, None])
-    block, local = cells.div(VOXELS, rounding_mode="floor"), cells % VOXELS
-    whole = field.topology.keys[block].long() * BLOCK + torch.stack([local % BLOCK, local // BLOCK % BLOCK, local // BLOCK**2], 1)
-    contracted = (whole + place.double()) * field.grid.voxel - space.extent
+    contracted = (cells.corner + place.double()) * field.grid.voxel - space.extent
     centre = back.points(space.to_working(contracted).numpy())
     jacobian = _expansion(field, contracted) * (field.grid.voxel * space.half * back.scale)
     jacobian = torch.from_numpy(back.rotation) @ jacobian
@@ -232,16 +278,6 @@ def _fitted_harmonics(sums: Tensor) -> Tensor:
     return torch.linalg.solve(matrix + torch.diag_embed(ridge), right)
 
 
-def _cube_cell(directions: Array) -> Array:
-    """(N, 3) directions → (N,) cells of a cube around the camera."""
-    axis = np.abs(directions).argmax(1)
-    main = np.take_along_axis(directions, axis[:, None], 1)[:, 0]
-    face = 2 * axis + (main > 0)
-    others = np.stack([np.take_along_axis(directions, ((axis + step) % 3)[:, None], 1)[:, 0] for step in (1, 2)], 1)
-    at = np.clip((np.arctan(others / np.abs(main)[:, None]) * (2 / np.pi) + 0.5) * SKY_SIDE, 0, SKY_SIDE - 1).astype(np.int64)
-    return (face * SKY_SIDE + at[:, 0]) * SKY_SIDE + at[:, 1]
-
-
 def _cube_directions() -> Array:
     """(6 · SKY_SIDE², 3) unit vectors to the middles of the cells."""
     face, row, column = np.unravel_index(np.arange(6 * SKY_SIDE**2), (6, SKY_SIDE, SKY_SIDE))
@@ -252,14 +288,9 @@ def _cube_directions() -> Array:
     return out / np.linalg.norm(out, axis=1, keepdims=True)
 
 
-def _sky_gaussians(field: Field, targets: Targets, sky: Array, origin: Array) -> Array:
-    """(S, 11 + 12) large Gaussians far behind all others in the background's colours: where training views see through them, and, if they
-    do anywhere, in all directions in which none looks."""
-    open_to = sky > SKY_LIGHT
-    kept = open_to | np.isnan(sky) if open_to.any() else open_to
-    direction = _cube_directions()[kept]
-    if not len(direction):
-        return np.zeros((0, G.HARMONICS + 12), np.float32)
+def _sky_gaussians(field: Field, targets: Targets, origin: Array) -> Array:
+    """(6 · SKY_SIDE², 11 + 12) large Gaussians far behind all others, in the colours that the field has where it has nothing."""
+    direction = _cube_directions()
     unit = torch.from_numpy(direction.astype(np.float32))
     colour = np.tile(field.background.numpy(), (len(unit), 1)) if field.sky is None else sky_colours(field.sky, unit).numpy()
     back = targets.input_from_working

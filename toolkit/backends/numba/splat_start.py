@@ -19,7 +19,7 @@ SUMS = 33
 
 @njit(**K.OPTIONS)
 def gather_pass(
-    space: Any, volume: Any, slots: Any, origins: Any, directions: Any, seen: Any, colours: Any, limits: Any, left: Any, sums: Any
+    space: Any, volume: Any, slots: Any, origins: Any, directions: Any, seen: Any, colours: Any, limits: Any, sums: Any
 ) -> None:
     """March rays (B, 3) and add to the sums of the voxels that have a slot.
 
@@ -27,7 +27,6 @@ def gather_pass(
         slots: (M · 512,) int32 row of a voxel among sums (S, SUMS) float32; −1: none.
         limits: float32 stop and threshold, see `march_ray`.
         seen: (B, 3) the rays' directions in the frame of the harmonics; colours: (B, 3) of their pixels.
-        left: (B,) light that nothing stops, written.
     """
     stop, threshold = limits
     samples = Samples(np.empty(K.MOST_KEPT, np.int32), np.empty((K.MOST_KEPT, 8), np.int32), np.empty((K.MOST_KEPT, K.VALUES), np.float32))
@@ -37,7 +36,6 @@ def gather_pass(
         line = origins[ray, 0], origins[ray, 1], origins[ray, 2], directions[ray, 0], directions[ray, 1], directions[ray, 2]
         last = march_ray(space, volume, line, K.ZERO, stop, threshold, marks, K.START, samples, result)
         encode_direction(seen[ray, 0], seen[ray, 1], seen[ray, 2], basis, K.START, K.START)
-        left[ray] = result[1]
         i = 0
         while i < last:
             cell, enters, weight = cells[i], values[i, K.AFTER] + values[i, K.WEIGHT], K.ZERO
