@@ -15,6 +15,7 @@ from fieldfuse.camera import Array
 from fieldfuse.capture.convert import all_converted, stored_cameras
 from fieldfuse.capture.select import SELECTED
 from fieldfuse.capture.types import Capture
+from fieldfuse.capture.unpack import folder_around
 from fieldfuse.errors import InputError
 from fieldfuse.export.cameras import write_cameras
 from fieldfuse.export.surface import Originals, at_most, surface_of_field, whole_mesh
@@ -217,8 +218,9 @@ def put_cameras(folder: Path, poses: PoseResult, posed: Capture, points: Array |
         points, colours: (P, 3) of a surface in the input's frame, for poses that came without points: programs that start from points
             need some.
     """
-    made_here = SELECTED in posed.extra or all_converted(posed)  # then the images lie in the run's folder
-    root = posed.frames[0].image.parent.parent if made_here else posed.root
+    cut = all(frame.instant is not None for frame in posed.frames)
+    made_here = cut or SELECTED in posed.extra or all_converted(posed)  # then the images lie in the run's folder
+    root = posed.frames[0].image.parents[2 if cut else 1] if made_here else folder_around(posed.root) or posed.root
     # A capture that is reached through a link has its images where the link leads.
     bases = (root, root.resolve())
     paths = [frame.image for frame in posed.frames]

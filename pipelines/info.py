@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json as writer
 from collections import Counter
+from contextlib import suppress
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -27,7 +28,7 @@ BESIDE = 140  # characters that a line must have for the evidence to stand in th
 SHOWN = {"views": "views {}", "psnr": "PSNR {:.2f} dB", "ssim": "SSIM {:.3f}", "lpips": "LPIPS {:.3f}"}
 
 
-@takes("quiet json")
+@takes("depth_scale quiet json")
 def info(
     target: Annotated[Path, typer.Argument(metavar="SOURCE", help="A source, or the folder of an earlier run.", show_default=False)],
     fast: Annotated[bool, typer.Option("--fast", help="Read headers only; pictures are not looked at for damage.")] = False,
@@ -36,12 +37,17 @@ def info(
     options: Options,
 ) -> None:
     """Tell what was detected: kind, counts, sizes, lenses, depth, warnings."""
+    from fieldfuse.capture.unpack import unpacked
     from fieldfuse.pipelines.folder import is_run_folder
 
     quiet = options.quiet or options.json
-    data = run_facts(target) if is_run_folder(target) else source_facts(target, fast, quiet)
-    if effects:
-        data["effects"] = effects_facts(target, quiet)
+    with unpacked(target) as place:
+        data = run_facts(target) if is_run_folder(target) else source_facts(place, fast, quiet, options.depth_scale)
+        if effects:
+            data["effects"] = effects_facts(place, quiet)
+    if place != target:
+        data["source"] = str(target)
+        data["warnings"] = [text.replace(str(place), str(target)) for text in data["warnings"]]
     if options.json:
         typer.echo(writer.dumps(data, indent=1))
         return
@@ -52,16 +58,17 @@ def info(
             typer.echo(line)
 
 
-def source_facts(source: Path, fast: bool, quiet: bool) -> dict[str, Any]:
+def source_facts(source: Path, fast: bool, quiet: bool, depth_scale: str | None = None) -> dict[str, Any]:
     """Facts of a capture; with `fast` no pixel is decoded."""
     from fieldfuse.capture import open_capture
     from fieldfuse.capture.checks import check_capture
+    from fieldfuse.capture.depth_checks import with_depth_scale
     from fieldfuse.capture.photos import unused
     from fieldfuse.pipelines.console import make_progress
     from fieldfuse.pipelines.source import describe_capture
     from fieldfuse.poses.check_given import best_fitting
 
-    capture, agreement = open_capture(source, choose=None if fast else best_fitting), None
+    capture, agreement = with_depth_scale(open_capture(source, choose=None if fast else best_fitting), depth_scale), None
     if not fast:
         progress = make_progress(quiet)
         with progress.listening():
@@ -79,18 +86,38 @@ def source_facts(source: Path, fast: bool, quiet: bool) -> dict[str, Any]:
         "ordered": capture.ordered,
         "depth_scale": capture.depth_scale if capture.has_depth else None,
         "unused": unused(capture),
+        "alpha": None if fast else see_through(capture),
         "poses": agreement,
         "warnings": list(capture.warnings),
     }
 
 
+def see_through(capture: Capture) -> str | None:
+    """How much of its images a capture's alpha cuts away, by a few of them."""
+    import numpy as np
+
+    from fieldfuse.capture.images import load_image, spread
+    from fieldfuse.errors import InputError
+
+    if not capture.alpha or capture.filmed:
+        return None
+    shares = []
+    for frame in spread(capture.frames, 5):
+        with suppress(InputError):
+            image = load_image(frame)
+            shares.append(float((image[..., 3] < 128).mean()) if image.shape[2] == 4 else 0.0)
+    return f"cuts {100 * np.mean(shares or [0.0]):.0f}% of the images away (by {len(shares)} of {len(capture.frames)})"
+
+
 def check_poses(capture: Capture, progress: Progress) -> tuple[str | None, list[str]]:
     """How well the poses that a capture brings fit its images, in a line, and what a run would warn of or refuse."""
+    from fieldfuse.camera import EQUIRECTANGULAR
     from fieldfuse.errors import PoseError
     from fieldfuse.poses.check_given import Agreement, check_given
     from fieldfuse.poses.result import given_poses
 
-    if capture.filmed or not capture.posed:
+    panoramas = any(frame.intrinsics is not None and frame.intrinsics.lens == EQUIRECTANGULAR for frame in capture.frames)
+    if capture.filmed or not capture.posed or panoramas:
         return None, []
     try:
         result = check_given(capture, given_poses(capture), progress=progress)

@@ -31,6 +31,8 @@ _TARGET = "The folder of an earlier run; or a source, then --out is needed."
 _TOTAL = "Seconds for the whole run: picture size, voxels, a video's frames, fitting time and exports are chosen for it."
 _START = "Start of the fit: network, classical, or auto (default): the networks' with fewer than 24 training pictures."
 _FINETUNE = "Whether the networks' field is fitted (default), or the result."
+_SCALE = "Measured distance of two marked points: 'IMG_1:812,330 IMG_2:1204,341 = 1.20' (metres)."
+_MARKER = "ArUco markers in the pictures and their side in metres: DICT_4X4_50:0.05."
 Source = Annotated[Path, typer.Argument(help=_SOURCE, show_default=False)]
 Target = Annotated[Path, typer.Argument(help=_TARGET, show_default=False)]
 Out = Annotated[Path, option("Folder for everything that the run makes.", "--out", "-o")]
@@ -48,6 +50,9 @@ Decoder = Annotated[str | None, option("deferred (default) or per_sample (the pa
 Init = Annotated[str | None, option(_START)]
 Finetune = Annotated[bool | None, option(_FINETUNE, "--finetune/--no-finetune")]
 PosesFrom = Annotated[str | None, option("auto (default), given, or sfm: ignore given poses.", "--poses")]
+DepthScale = Annotated[str | None, option("Stored depth values to a metre, as 5000, or what one stands for, as 0.25mm.")]
+Scale = Annotated[str | None, option(_SCALE)]
+Marker = Annotated[str | None, option(_MARKER)]
 Baked = Annotated[bool, option("Take the baked field, as pages have it; it is made if need be.", "--baked")]
 Config = Annotated[Path | None, option("YAML file with settings.")]
 Pairs = Annotated[list[str] | None, option("Any setting as key=value; may be repeated.", "--set", metavar="KEY=VALUE")]
@@ -86,6 +91,9 @@ class Options:
     init: Init = None
     finetune: Finetune = None
     poses: PosesFrom = None
+    depth_scale: DepthScale = None
+    scale: Scale = None
+    marker: Marker = None
     config: Config = None
     pairs: Pairs = None
     quiet: Quiet = False
@@ -97,7 +105,10 @@ class Options:
         return gather(self.preset, self.config, [*pairs, *(self.pairs or [])], **given, **flags)
 
 
-FLAGS = ("budget", "image_size", "holdout", "device", "threads", "seed", "engine", "decoder", "init", "finetune", "poses")
+FLAGS = (
+    *("budget", "image_size", "holdout", "device", "threads", "seed", "engine", "decoder", "init", "finetune", "poses"),
+    *("depth_scale", "scale", "marker"),
+)
 
 
 def gather(preset: str | None = None, config: Path | None = None, pairs: list[str] | None = None, **flags: Any) -> dict[str, Any]:

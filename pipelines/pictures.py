@@ -103,9 +103,31 @@ def put_page(job: Job, path: Path, field: Field, views: Views, scene: Scene) -> 
         OutputError: the file cannot be written.
     """
     from fieldfuse.export.page import Tour, require_page, write_page
+    from fieldfuse.poses.region import ROOM
 
     require_page(field)
     _, _, around = orbit_cameras(views, scene, FLIGHT)
-    cameras = (views.names, views.intrinsics, views.world_from_camera, views.test)
-    write_page(path, baked(job, field, views), Tour(*cameras, around, scene.median_depth, views.exposure), job.source.name)
+    bytes_ = baked(job, field, views)
+    tour = Tour(
+        *(views.names, views.intrinsics, views.world_from_camera, views.test),
+        path=around,
+        depth=scene.median_depth,
+        exposure=views.exposure,
+        start=_start(field, views, scene),
+        working_from_input=scene.working_from_input,
+        metric=scene.metric,
+        region=scene.surface_box(),
+        inside=scene.layout == ROOM,
+    )
+    write_page(path, bytes_, tour, job.source.name)
     return path
+
+
+def _start(field: Field, views: Views, scene: Scene) -> int:
+    """The training view that shows most."""
+    from fieldfuse.render.image import make_renderer, render_view
+    from fieldfuse.render.overview import overview
+
+    train = np.flatnonzero(~views.test)
+    render = partial(render_view, field, view=make_renderer(field))
+    return int(train[overview(render, [views.intrinsics[i] for i in train], views.world_from_camera[train], scene.median_depth)])

@@ -10,11 +10,12 @@ from typing import Any
 import numpy as np
 
 from fieldfuse import steps
-from fieldfuse.capture.film import DEPTH
 from fieldfuse.capture.photos import with_unposed
 from fieldfuse.capture.prepare import limited
-from fieldfuse.capture.storage import capture_from_dict, capture_to_dict, load_views, save_views
+from fieldfuse.capture.sphere import SIDE, to_cut
+from fieldfuse.capture.storage import PATHS, capture_from_dict, capture_to_dict, load_views, save_views
 from fieldfuse.capture.types import Capture, Frame, Views
+from fieldfuse.capture.unpack import SUFFIX, UNPACKED
 from fieldfuse.effects.correct import Corrections
 from fieldfuse.errors import InputError
 from fieldfuse.files import read_json, write_json
@@ -24,10 +25,12 @@ from fieldfuse.pipelines.job import Job
 from fieldfuse.pipelines.schemas import Effects, read_checked
 from fieldfuse.pipelines.source import pixel_state, source_state
 from fieldfuse.pipelines.stages import InPlaceStage, Stage
+from fieldfuse.poses import scaling
 from fieldfuse.poses.check_given import VERSION as CHECKED
 from fieldfuse.poses.job import VERSION
 from fieldfuse.poses.points import Features
-from fieldfuse.poses.result import PoseResult
+from fieldfuse.poses.result import SFM, PoseResult
+from fieldfuse.poses.scaling import Scaling, wanted
 from fieldfuse.poses.scene import Scene, describe_scene
 
 EFFECTS_FILE = "effects.json"
@@ -61,7 +64,7 @@ def prepare(job: Job, capture: Capture | None = None) -> Prepared:
     """Everything up to the views; `capture`: from `find_capture`, where that was called before."""
     features: dict[str, Features] = {}  # of images by name, as they are extracted on the way
     capture = choose_frames(job, find_capture(job) if capture is None else capture)
-    poses = find_camera_poses(job, capture, features)
+    capture, poses = find_scaling(job, capture, find_camera_poses(job, capture, features))
     posed = limited(poses.apply(capture), job.settings.capture.holdout, job.settings.views.limit)
     corrections = find_effects(job, posed)
     poses, posed = steps.refined(poses, corrections), corrections.on_capture(posed)
@@ -74,15 +77,17 @@ def prepare(job: Job, capture: Capture | None = None) -> Prepared:
 def find_capture(job: Job) -> Capture:
     """Detect what the source is, read it, look at every image once (at those that `choose_frames` writes, then)."""
     path = job.folder / "capture.json"
-    masks, light = job.settings.capture.masks, job.settings.capture.light
+    masks, light, projection = job.settings.capture.masks, job.settings.capture.light, job.settings.capture.projection
     state = source_state(job.source, job.folder.path)
-    given = [*([masks] if masks != "auto" else []), *([f"light {light}"] if light != "auto" else [])]
+    given = [masks] if masks != "auto" else []
+    given += [f"{name} {value}" for name, value in (("light", light), ("projection", projection)) if value != "auto"]
+    given += [] if job.settings.capture.depth_scale is None else [f"depth_scale {job.settings.capture.depth_scale}"]
     found = job.run(
         Stage(
             "capture",
-            make=lambda: steps.read_capture(job.source, job.settings, job.progress),
-            save=lambda capture: [_written(path, capture_to_dict(capture))],
-            load=lambda: capture_from_dict(read_json(path)),
+            make=lambda: steps.read_capture(job.source, job.folder.path, job.settings, job.progress),
+            save=lambda capture: [*_files_below(job.folder / UNPACKED), _written(path, capture_to_dict(capture))],
+            load=lambda: in_run(capture_from_dict(read_json(path)), job),
             settings=[state, *given] if given else state,
         )
     )
@@ -94,6 +99,26 @@ def _written(path: Path, data: Any) -> Path:
     return path
 
 
+def _files_below(folder: Path) -> list[Path]:
+    return [path for path in sorted(folder.rglob("*")) if path.is_file()]
+
+
+def in_run(capture: Capture, job: Job) -> Capture:
+    """The capture of a zip file where its files are now: the run's folder, in which they were unpacked, may have been moved."""
+    if job.source.suffix.lower() != SUFFIX or UNPACKED not in capture.root.parts or capture.root.is_relative_to(job.folder / UNPACKED):
+        return capture
+    at = max(index for index, part in enumerate(capture.root.parts) if part == UNPACKED)
+    before, now = Path(*capture.root.parts[: at + 1]), job.folder / UNPACKED
+
+    def here(path: Path) -> Path:
+        return now / path.relative_to(before) if path.is_relative_to(before) else path
+
+    frames = [
+        replace(frame, **{name: here(path) for name in PATHS if (path := getattr(frame, name)) is not None}) for frame in capture.frames
+    ]
+    return replace(capture, root=here(capture.root), frames=tuple(frames))
+
+
 def choose_frames(job: Job, capture: Capture) -> Capture:
     """Images of a video or a film, and JPEGs of HEIF and mirrored images; other captures pass as they are."""
     if not steps.needs_frames(capture):
@@ -101,12 +126,16 @@ def choose_frames(job: Job, capture: Capture) -> Capture:
     folder = job.folder / "frames"
     path = folder / "capture.json"
 
+    depends: Any = job.settings.capture.max_frames if capture.filmed else pixel_state(capture)
+    if to_cut(capture) and (job.settings.capture.image_size or 0) > SIDE:
+        depends = [depends, job.settings.capture.image_size]
+
     def make() -> Capture:
         steps.set_seeds(job.settings.seed)
         return steps.write_frames(capture, job.folder.path, job.settings, job.progress)
 
     def save(chosen: Capture) -> list[Path]:
-        files = [file for frame in chosen.frames for file in (frame.image, frame.depth) if file is not None]
+        files = [file for frame in chosen.frames for file in (frame.image, frame.depth, frame.mask) if file is not None]
         return [*(file for file in files if file.is_relative_to(folder.resolve())), _written(path, capture_to_dict(chosen))]
 
     return job.run(
@@ -114,9 +143,9 @@ def choose_frames(job: Job, capture: Capture) -> Capture:
             "frames",
             make=make,
             save=save,
-            load=lambda: in_folder(capture_from_dict(read_json(path)), folder),
+            load=lambda: in_folder(in_run(capture_from_dict(read_json(path)), job), folder),
             inputs=["capture"],
-            settings=job.settings.capture.max_frames if capture.filmed else pixel_state(capture),
+            settings=depends,
         )
     )
 
@@ -124,12 +153,14 @@ def choose_frames(job: Job, capture: Capture) -> Capture:
 def in_folder(chosen: Capture, folder: Path) -> Capture:
     """The capture with what was written to a run's `frames` where that is now: the run's folder may have been moved."""
     def here(frame: Frame) -> Frame:
-        if not (frame.image.parent.name == folder.name and (folder / frame.image.name).is_file()):
+        before = frame.image.parent.parent if frame.instant else frame.image.parent  # the run's `frames`, where that was
+        if before.name != folder.name or not (folder / frame.image.relative_to(before)).is_file():
             return frame
-        depth = frame.depth
-        if depth is not None and depth.parent == frame.image.parent / DEPTH:
-            depth = folder / DEPTH / depth.name
-        return replace(frame, image=folder / frame.image.name, depth=depth)
+
+        def moved(path: Path | None) -> Path | None:
+            return folder / path.relative_to(before) if path is not None and path.is_relative_to(before) else path
+
+        return replace(frame, image=folder / frame.image.relative_to(before), depth=moved(frame.depth), mask=moved(frame.mask))
 
     return chosen.with_frames([here(frame) for frame in chosen.frames])
 
@@ -147,7 +178,8 @@ def find_camera_poses(job: Job, capture: Capture, features: dict[str, Features] 
     if given:
         depends += [CHECKED, settings.poses.convention]  # the files are in the stages before
     else:
-        found = {name: value for name, value in asdict(settings.poses).items() if name != "convention"}
+        besides = ("convention", "scale", "marker", "gps")  # which change nothing of what is found here
+        found = {name: value for name, value in asdict(settings.poses).items() if name not in besides}
         depends += [VERSION, found, settings.seed, pixel_state(capture)]
     return job.run(
         InPlaceStage(
@@ -159,6 +191,29 @@ def find_camera_poses(job: Job, capture: Capture, features: dict[str, Features] 
             settings=depends,
         )
     )
+
+
+def find_scaling(job: Job, capture: Capture, poses: PoseResult) -> tuple[Capture, PoseResult]:
+    """Capture and poses in metres, and placed on earth, where measured distances, markers or the images' GPS allow it."""
+    settings, path = job.settings.poses, job.folder / "scaling.json"
+    scene = job.stages.record("scene")
+    if scene is not None and "scene" in job.stages.trusted and scene.after.get("poses") == job.stages.records["poses"].made:
+        there = "scaling" in scene.after  # what the folder's results stand on, whatever images and settings are now
+    else:
+        there = wanted(capture, settings, poses.source == SFM)
+    if not there:
+        return capture, poses
+    found = job.run(
+        Stage(
+            "scaling",
+            make=lambda: scaling.find_scaling(capture, poses, settings, job.progress),
+            save=lambda found: [_written(path, found.to_dict())],
+            load=lambda: Scaling.from_dict(read_json(path)),
+            inputs=["poses"],
+            settings=[settings.scale, settings.marker, settings.gps, pixel_state(capture)],
+        )
+    )
+    return found.apply(capture, poses)
 
 
 def find_effects(job: Job, posed: Capture) -> Corrections:
@@ -177,7 +232,7 @@ def find_effects(job: Job, posed: Capture) -> Corrections:
             make=make,
             save=lambda data: [_written(path, data)],
             load=partial(read_checked, path, Effects),
-            inputs=["poses"],
+            inputs=job.stages.done("poses", "scaling"),
             settings=[asdict(settings.effects), settings.capture.holdout, [frame.name for frame in posed.frames], pixel_state(posed)],
             version=4,
         )
@@ -206,7 +261,7 @@ def measure_scene(job: Job, posed: Capture, features: dict[str, Features] | None
             make=make,
             save=lambda scene: [_written(path, scene.to_dict())],
             load=lambda: Scene.from_dict(read_json(path)),
-            inputs=job.stages.done("poses", "effects"),
+            inputs=job.stages.done("poses", "scaling", "effects"),
             settings=limit_of(job),
         )
     )
@@ -236,7 +291,7 @@ def make_views(job: Job, posed: Capture, scene: Scene, corrections: Corrections 
             make=lambda: steps.prepared(posed, scene, job.settings, job.progress, corrections),
             save=save,
             load=load,
-            inputs=job.stages.done("poses", "effects", "scene"),
+            inputs=job.stages.done("poses", "scaling", "effects", "scene"),
             settings=[settings.image_size, settings.holdout, limit_of(job), pixel_state(posed)],
         )
     )

@@ -15,7 +15,7 @@ from fieldfuse.pipelines.fields import (
     uses_network,
 )
 from fieldfuse.pipelines.job import Job
-from fieldfuse.pipelines.prepare import Prepared, choose_frames, find_camera_poses, find_capture, prepare
+from fieldfuse.pipelines.prepare import Prepared, choose_frames, find_camera_poses, find_capture, find_scaling, prepare
 from fieldfuse.pipelines.splats import SPLATS, make_splats, render_splats
 from fieldfuse.pipelines.summary import Results, put_report, summarise_poses
 from fieldfuse.pipelines.surfaces import fuse_tsdf, match_images
@@ -29,7 +29,7 @@ FOR_FIELD = ("network", "direct")  # made with the field
 def find_poses(job: Job) -> dict[str, Any]:
     """Camera poses alone; answers a summary of them."""
     capture = choose_frames(job, find_capture(job))
-    return summarise_poses(job, capture, find_camera_poses(job, capture))
+    return summarise_poses(job, *find_scaling(job, capture, find_camera_poses(job, capture)))
 
 
 def reconstruct(job: Job, goals: frozenset[str], go_on: bool, formats: list[str] | None, total_budget: float | None) -> dict[str, Any]:

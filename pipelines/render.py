@@ -18,13 +18,22 @@ class CameraPath:
 
     views: Annotated[str, typer.Option(help="orbit, or test: the held-out views.")] = "orbit"
     cameras: Annotated[
-        Path | None, typer.Option(help="A transforms.json with the cameras to render, in the capture's frame.", show_default=False)
+        Path | None,
+        typer.Option(
+            "--cameras",
+            "--path",
+            help="Cameras to render, in the capture's frame: a transforms.json, or a camera path as field.html and nerfstudio write it.",
+            show_default=False,
+        ),
     ] = None
     to: Annotated[
         Path | None, typer.Option(help="An .mp4 file, or a folder for PNG pictures. Default: in DIR/renders.", show_default=False)
     ] = None
     frames: Annotated[int, typer.Option(min=2, help="Pictures of the orbit.")] = 90
-    fps: Annotated[float, typer.Option(min=1, max=1000, help="Pictures a second of a video.")] = 30
+    fps: Annotated[
+        float | None,
+        typer.Option(min=1, max=1000, help="Pictures a second of a video. Default: the path's own, else 30.", show_default=False),
+    ] = None
     image_size: Annotated[int | None, typer.Option(min=16, help="Long side of the pictures in pixels.", show_default=False)] = None
 
 

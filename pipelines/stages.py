@@ -27,7 +27,7 @@ from fieldfuse.pipelines.console import ConsoleProgress
 from fieldfuse.pipelines.folder import STAGES, RunFolder
 
 T = TypeVar("T")
-BEFORE = ("capture", "frames", "poses", "effects", "scene", "keyframes", "views")  # what every result of a run stands on
+BEFORE = ("capture", "frames", "poses", "scaling", "effects", "scene", "keyframes", "views")  # what every result of a run stands on
 INTERVAL = 0.2  # seconds between two samples of this process's memory
 CHILDREN_EVERY = 3  # samples between two looks at the children, which cost far more
 

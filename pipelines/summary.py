@@ -50,7 +50,7 @@ SEES = {
     "low": "colours depend on the direction of view in first order",
     "full": "colours depend on the direction of view",
 }
-POSES = ("source", "registered", "total", "models", "missing", "seconds", "agreement")
+POSES = ("source", "registered", "total", "models", "missing", "seconds", "agreement", "metric", "scaling")
 OPENED = {".html", ".ply", ".spz", ".obj", ".glb", ".mp4", ".txt", ".json"}
 NO_TEST_VIEWS = "no image was held out, so there are no scores; give --holdout 8 to keep every 8th image for testing"
 
@@ -62,7 +62,10 @@ def base_data(job: Job, capture: Capture, poses: PoseResult) -> dict[str, Any]:
         "created": datetime.now(UTC).isoformat(timespec="seconds"),
         "source": str(job.source),
         "capture": describe_capture(capture),
-        "poses": {name: getattr(poses, name) for name in POSES},
+        "poses": {
+            **{name: getattr(poses, name) for name in POSES},
+            "georeference": None if poses.georeference is None else poses.georeference.to_dict(),
+        },
         "stages": job.stages.summary(),
         "settings": settings_dict(job.settings),
         "machine": {"python": platform.python_version(), "system": platform.platform(), "device": job.settings.device},

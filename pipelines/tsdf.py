@@ -10,7 +10,7 @@ from fieldfuse.pipelines.options import Options, Place, takes
 from fieldfuse.pipelines.work import work
 
 
-@takes("image_size holdout poses threads config pairs quiet json")
+@takes("image_size holdout poses depth_scale threads config pairs quiet json")
 def tsdf(
     place: Place,
     voxel_size: Annotated[

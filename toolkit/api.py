@@ -8,9 +8,10 @@
     scores = ff.evaluate(field, scene)              # at the held-out views
     field.to_mesh().save("mesh.glb")
 
-Cameras, depth, meshes and points are in the source's own frame and unit of length, with OpenCV's axes (x right, y down, z forward). Nothing
-here prints, or changes the threads or random generators of the caller; remarks go to the logger "fieldfuse". Functions take settings by the
-names that `--set` has: the short ones as keywords (`image_size=320`), all of them in `settings={"field.channels": 8}`.
+Cameras, depth, meshes and points are in the source's own frame and unit of length (in metres with `scale`, `marker` or GPS), with
+OpenCV's axes (x right, y down, z forward). Nothing here prints, or changes the threads or random generators of the caller; remarks go to
+the logger "fieldfuse". Functions take settings by the names that `--set` has: the short ones as keywords (`image_size=320`), all of them in
+`settings={"field.channels": 8}`.
 """
 
 from __future__ import annotations
@@ -81,13 +82,15 @@ def load(
     folder = Path(files.name if files is not None else workdir or ".")
 
     with steps.seeded(chosen.seed):
-        capture = steps.read_capture(path.absolute(), chosen, listening(progress, "capture"))
+        capture = steps.read_capture(path.absolute(), folder, chosen, listening(progress, "capture"))
         if chosen.poses.source == "sfm":
             capture = with_unposed(capture)
         if steps.needs_frames(capture):
             capture = steps.write_frames(capture, folder, chosen, listening(progress, "frames"))
         features: dict[str, Features] = {}
         poses = steps.camera_poses(capture, folder, chosen, listening(progress, "poses"), features)
+        if (scaling := steps.find_scaling(capture, poses, chosen, listening(progress, "scaling"))) is not None:
+            capture, poses = scaling.apply(capture, poses)
         posed = limited(poses.apply(capture), chosen.capture.holdout, chosen.views.limit)
         corrections, effects = Corrections(), []
         if steps.looks_for_effects(chosen):

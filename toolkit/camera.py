@@ -23,7 +23,9 @@ Array = NDArray[Any]
 PINHOLE = "pinhole"
 OPENCV = "opencv"  # k1, k2, p1, p2[, k3[, k4, k5, k6]] as in OpenCV
 FISHEYE = "fisheye"  # k1, k2, k3, k4 of OpenCV's equidistant model
-LENSES = (PINHOLE, OPENCV, FISHEYE)
+EQUIRECTANGULAR = "equirectangular"  # the whole sphere: longitude across, latitude down, the axis z in the middle
+LENSES = (PINHOLE, OPENCV, FISHEYE, EQUIRECTANGULAR)
+WIDEST = float(np.radians(100.0))  # off the axis: farther out fisheye lenses show hardly anything that is sharp
 
 
 @dataclass(frozen=True)
@@ -56,9 +58,14 @@ class Intrinsics:
         """The same camera without its lens."""
         return replace(self, lens=PINHOLE, distortion=())
 
+    @classmethod
+    def equirectangular(cls, width: int, height: int) -> Intrinsics:
+        """The camera of a 360° panorama of that size: fx, fy are pixels a radian of longitude and latitude."""
+        return cls(width, height, width / (2 * np.pi), height / np.pi, width / 2, height / 2, EQUIRECTANGULAR)
+
     @property
     def distorted(self) -> bool:
-        return self.lens == FISHEYE or any(abs(value) > 0 for value in self.distortion)
+        return self.lens in (FISHEYE, EQUIRECTANGULAR) or any(abs(value) > 0 for value in self.distortion)
 
     def checked(self, where: str) -> Intrinsics:
         """Self, when it is a usable camera.
@@ -75,7 +82,7 @@ class Intrinsics:
             raise InputError(f"{where}: the image size {self.width}×{self.height} is not usable")
         if self.lens not in LENSES:
             raise InputError(f"{where}: the lens model {self.lens!r} is not known; known are {', '.join(LENSES)}")
-        most = {PINHOLE: 0, FISHEYE: 4}.get(self.lens, 14)
+        most = {PINHOLE: 0, FISHEYE: 4, EQUIRECTANGULAR: 0}.get(self.lens, 14)
         if len(self.distortion) > most and any(self.distortion[most:]):
             given = len(self.distortion)
             raise InputError(f"{where}: the lens model {self.lens!r} takes at most {most} coefficients, here are {given}; correct them")
@@ -120,6 +127,8 @@ def distort(intrinsics: Intrinsics, points: Array) -> Array:
     points = np.asarray(points, dtype=np.float64).reshape(-1, 2)
     if not intrinsics.distorted or len(points) == 0:
         return points.copy()
+    if intrinsics.lens == EQUIRECTANGULAR:
+        return np.stack([np.arctan(points[:, 0]), np.arctan2(points[:, 1], np.hypot(points[:, 0], 1.0))], axis=1)
     rays = np.concatenate([points, np.ones((len(points), 1))], axis=1)
     coefficients = _coefficients(intrinsics)
     if intrinsics.lens == FISHEYE:
@@ -150,6 +159,71 @@ def lens_limit(intrinsics: Intrinsics, radius: float) -> float:
     bent = distort(replace(intrinsics, distortion=tuple(radial)), np.stack([steps, np.zeros_like(steps)], axis=1))[:, 0]
     folded = np.flatnonzero(~(np.diff(bent) > 0))
     return float(steps[folded[0]]) if len(folded) else radius
+
+
+def seen_at(intrinsics: Intrinsics, directions: Array) -> tuple[Array, Array]:
+    """Where a camera shows directions (..., 3) in its own axes, whatever their length; also those beside and behind it that its lens shows.
+
+    Returns:
+        pixels (..., 2), centres at +0.5, and (...) bool whether the direction lies in the image: there the lens model is one-to-one, and of
+        a fisheye lens at most `WIDEST` off the axis. Pixels of other directions mean nothing.
+    """
+    with np.errstate(over="ignore", invalid="ignore"):  # coefficients may be anybody's
+        return _seen_at(intrinsics, *np.moveaxis(np.asarray(directions, dtype=np.float64), -1, 0))
+
+
+def _seen_at(intrinsics: Intrinsics, x: Array, y: Array, z: Array) -> tuple[Array, Array]:
+    flat = np.hypot(x, y)
+    if intrinsics.lens == EQUIRECTANGULAR:
+        place, seen = np.stack([np.arctan2(x, z), np.arctan2(y, np.hypot(x, z))], axis=-1), np.ones(x.shape, dtype=bool)
+    elif intrinsics.lens == FISHEYE:
+        angle = np.arctan2(flat, z)
+        seen = angle < _fisheye_limit(intrinsics)
+        place = np.stack([x, y], axis=-1) * (_fisheye_radius(intrinsics, angle) / np.maximum(flat, 1e-12))[..., None]
+    else:
+        ideal = np.stack([x, y], axis=-1) / np.where(z > 1e-9, z, 1.0)[..., None]
+        seen = (z > 1e-9) & (np.hypot(ideal[..., 0], ideal[..., 1]) <= lens_limit(intrinsics, float(np.tan(np.radians(80)))))
+        place = distort(intrinsics, ideal.reshape(-1, 2)).reshape(ideal.shape)
+    pixels = place * [intrinsics.fx, intrinsics.fy] + [intrinsics.cx, intrinsics.cy]
+    u, v = pixels[..., 0], pixels[..., 1]
+    if intrinsics.lens != EQUIRECTANGULAR:
+        seen &= (u >= 0) & (u <= intrinsics.width) & (v >= 0) & (v <= intrinsics.height)
+    return pixels, seen
+
+
+def directions_of(intrinsics: Intrinsics, pixels: Array) -> Array:
+    """(N, 2) pixels, centres at +0.5, of a camera without OpenCV's polynomial → (N, 3) unit directions in its axes, the reverse of
+    `seen_at`. Beyond what a fisheye lens shows, the direction is that of its rim."""
+    x, y = ((np.asarray(pixels, dtype=np.float64) - [intrinsics.cx, intrinsics.cy]) / [intrinsics.fx, intrinsics.fy]).T
+    if intrinsics.lens == EQUIRECTANGULAR:
+        return np.stack([np.sin(x) * np.cos(y), np.sin(y), np.cos(x) * np.cos(y)], axis=1)
+    if intrinsics.lens == FISHEYE:
+        radius = np.hypot(x, y)
+        angles = np.linspace(0, _fisheye_limit(intrinsics), 8193)  # inverted by a table: to a thousandth of a pixel, and better
+        with np.errstate(over="ignore", invalid="ignore"):
+            angle = np.interp(radius, _fisheye_radius(intrinsics, angles), angles)
+        aside = np.sin(angle) / np.maximum(radius, 1e-12)
+        return np.stack([x * aside, y * aside, np.cos(angle)], axis=1)
+    if intrinsics.distorted:
+        raise ValueError("the polynomial of OpenCV's lens is inverted elsewhere")
+    rays = np.stack([x, y, np.ones_like(x)], axis=1)
+    return np.asarray(rays / np.linalg.norm(rays, axis=1, keepdims=True))
+
+
+def _fisheye_radius(intrinsics: Intrinsics, angle: Array) -> Array:
+    """θ(1 + k1·θ² + k2·θ⁴ + k3·θ⁶ + k4·θ⁸) of OpenCV's fisheye model."""
+    square, total = angle * angle, np.zeros_like(angle)
+    for value in reversed(_coefficients(intrinsics)):
+        total = (total + value) * square
+    return np.asarray(angle * (1 + total))
+
+
+def _fisheye_limit(intrinsics: Intrinsics) -> float:
+    """Radians off the axis, at most `WIDEST`, up to which a fisheye lens is one-to-one."""
+    angles = np.linspace(0, WIDEST, 2049)
+    with np.errstate(over="ignore", invalid="ignore"):
+        folded = np.flatnonzero(~(np.diff(_fisheye_radius(intrinsics, angles)) > 0))
+    return float(angles[folded[0]]) if len(folded) else WIDEST
 
 
 def resample_maps(source: Intrinsics, target: Intrinsics) -> tuple[Array, Array, Array]:

@@ -9,7 +9,7 @@ import difflib
 import json
 import re
 from collections import Counter
-from collections.abc import Iterable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import asdict, dataclass, fields, is_dataclass
 from dataclasses import field as default
 from functools import cache
@@ -18,10 +18,11 @@ from pathlib import Path
 from typing import Annotated, Any, TypeVar
 
 import yaml
-from pydantic import BeforeValidator, Field, TypeAdapter, ValidationError
+from pydantic import AfterValidator, BeforeValidator, Field, TypeAdapter, ValidationError
 from pydantic_core import PydanticCustomError
 
 from fieldfuse.errors import InputError, brief, first_line
+from fieldfuse.measures import parse_marker, parse_scale, stored_per_metre
 
 MAX_YAML = 2**18  # characters
 MAX_NESTING = 16
@@ -64,6 +65,19 @@ def names_of(kind: str, known: tuple[str, ...]) -> BeforeValidator:
         return values
 
     return BeforeValidator(check)
+
+
+def read_by(parse: Callable[[Any], Any]) -> AfterValidator:
+    """For a value that `parse` reads when it is used: what it refuses is refused here."""
+
+    def check(value: Any) -> Any:
+        try:
+            parse(value)
+        except InputError as error:
+            raise PydanticCustomError("name", "{sentence}", {"sentence": str(error)}) from error
+        return value
+
+    return AfterValidator(check)
 
 
 @cache
@@ -244,6 +258,11 @@ class CaptureSettings:
     max_frames: Positive = 150  # frames taken from a video
     # auto: black is left out | inverted: white is | off: masks beside the images are not used
     masks: Annotated[str, one_of("auto", "inverted", "off")] = "auto"
+    # Stored depth values to a metre (5000), or what one stands for (0.25mm); None: as the source has it, or as fits its poses
+    depth_scale: Annotated[float | str, read_by(stored_per_metre)] | None = None
+    # auto: 360° panoramas are recognised, and these and fisheye images are cut into views | perspective: neither | equirectangular: all are
+    # panoramas
+    projection: Annotated[str, one_of("auto", "perspective", "equirectangular")] = "auto"
     # What floating-point pictures hold. auto: by format, profile and values | linear: light | display: values for screens (sRGB)
     light: Annotated[str, one_of("auto", "linear", "display")] = "auto"
 
@@ -259,6 +278,11 @@ class PosesSettings:
     max_features: Positive = 4096
     # auto (SIFT, and XFeat where SIFT places too few) | sift | xfeat (learned; needs its weights)
     features: Annotated[str, one_of("auto", "sift", "xfeat")] = "auto"
+    # Distances measured between points that are marked in images, and markers of known size: either makes poses metric (docs/scale.md)
+    scale: Annotated[str, read_by(parse_scale)] | None = None
+    marker: Annotated[str, read_by(parse_marker)] | None = None
+    # auto: the images' GPS places poses of structure from motion on earth, where it fits | off
+    gps: Annotated[str, one_of("auto", "off")] = "auto"
 
 
 @dataclass
@@ -399,6 +423,9 @@ class Settings:
 SHORT_NAMES = {
     "effects": "effects.mode",
     "poses": "poses.source",
+    "depth_scale": "capture.depth_scale",
+    "scale": "poses.scale",
+    "marker": "poses.marker",
     "image_size": "capture.image_size",
     "holdout": "capture.holdout",
     "budget": "fit.budget",
@@ -452,6 +479,8 @@ def load_settings(
     both = sorted(set(settings.effects.on) & set(settings.effects.off))
     if both:
         raise InputError(f"effects.on and effects.off both name {both[0]!r}; it can be in one of them")
+    if settings.poses.scale is not None and settings.poses.marker is not None:
+        raise InputError("scale and marker both give the unit of length; give one of them")
     if settings.capture.holdout == 1:
         raise InputError(f"holdout is {settings.capture.holdout}; it must be 0 (no test views) or at least 2")
     return settings

@@ -29,6 +29,7 @@ if TYPE_CHECKING:
     from fieldfuse.nerfusion.keyframes import KeyFrames
     from fieldfuse.poses.points import Features
     from fieldfuse.poses.result import PoseResult
+    from fieldfuse.poses.scaling import Scaling
     from fieldfuse.poses.scene import Scene
     from fieldfuse.training.from_network import Inference
 
@@ -93,8 +94,9 @@ def choose_device(wanted: str, engine: str = "auto") -> str:
     return device
 
 
-def read_capture(source: Path, settings: Settings, progress: Progress = SILENT) -> Capture:
-    """What the source is detected to be, every image of it looked at once (those that `write_frames` writes, then).
+def read_capture(source: Path, folder: Path, settings: Settings, progress: Progress = SILENT) -> Capture:
+    """What the source is detected to be, every image of it looked at once (those that `write_frames` writes, then). A zip file is unpacked
+    into `folder/unpacked`.
 
     Raises:
         InputError: it is not readable as any known layout, or too little of it is usable.
@@ -102,30 +104,40 @@ def read_capture(source: Path, settings: Settings, progress: Progress = SILENT) 
     from fieldfuse.capture import open_capture
     from fieldfuse.capture.checks import check_capture
     from fieldfuse.capture.convert import to_convert
+    from fieldfuse.capture.depth_checks import with_depth_scale
     from fieldfuse.capture.light import LIGHT
+    from fieldfuse.capture.unpack import UNPACKED, unpacked
     from fieldfuse.poses.check_given import best_fitting
 
-    capture = open_capture(source, settings.capture.masks, best_fitting)
-    if settings.capture.light != "auto":
-        capture = replace(capture, extra={**capture.extra, LIGHT: settings.capture.light})
-    return capture if to_convert(capture) else check_capture(capture, progress)
+    with unpacked(source, folder / UNPACKED, progress) as place:
+        capture = open_capture(place, settings.capture.masks, best_fitting, settings.capture.projection)
+        capture = with_depth_scale(capture, settings.capture.depth_scale)
+        if settings.capture.light != "auto":
+            capture = replace(capture, extra={**capture.extra, LIGHT: settings.capture.light})
+        return capture if to_convert(capture) else check_capture(capture, progress)
 
 
 def needs_frames(capture: Capture) -> bool:
-    """Whether images have to be written before they can be used: those of a video or film, HEIF, mirrored ones."""
+    """Whether images have to be written before they can be used: those of a video or film, HEIF, mirrored ones, views of panoramas and
+    fisheye images."""
     from fieldfuse.capture.convert import to_convert
+    from fieldfuse.capture.sphere import to_cut
 
-    return capture.filmed or bool(to_convert(capture))
+    return capture.filmed or bool(to_convert(capture)) or bool(to_cut(capture))
 
 
 def write_frames(capture: Capture, folder: Path, settings: Settings, progress: Progress = SILENT) -> Capture:
-    """The capture with images in `folder/frames`: chosen from a video or film, or converted from HEIF and mirrored ones."""
-    from fieldfuse.capture.convert import convert_images
+    """The capture with images in `folder/frames`: chosen from a video or film, converted from HEIF and mirrored ones, or cut into views."""
+    from fieldfuse.capture.convert import convert_images, to_convert
     from fieldfuse.capture.select import select_frames
+    from fieldfuse.capture.sphere import SIDE, cut_images, to_cut
 
+    threads = settings.threads or os.cpu_count() or 1
     if capture.filmed:
-        return select_frames(capture, folder, settings.capture, progress)
-    return convert_images(capture, folder, settings.threads or os.cpu_count() or 1, progress)
+        capture = select_frames(capture, folder, settings.capture, progress)
+    if to_convert(capture):
+        capture = convert_images(capture, folder, threads, progress)
+    return cut_images(capture, folder, threads, progress, max(SIDE, settings.capture.image_size or 0)) if to_cut(capture) else capture
 
 
 def uses_given_poses(capture: Capture, settings: Settings) -> bool:
@@ -146,11 +158,26 @@ def camera_poses(
     """
     from fieldfuse.poses.check_given import check_given
     from fieldfuse.poses.result import given_poses
+    from fieldfuse.poses.scaling import check_measures
     from fieldfuse.poses.sfm import find_poses
 
+    check_measures(capture, settings.poses)
     if uses_given_poses(capture, settings):
         return check_given(capture, given_poses(capture), settings.poses.convention, progress, {} if features is None else features)
     return find_poses(capture, folder, settings.poses, settings.seed, settings.threads, progress)
+
+
+def find_scaling(capture: Capture, poses: PoseResult, settings: Settings, progress: Progress = SILENT) -> Scaling | None:
+    """What makes the poses metric and places them on earth: measured distances, markers, the images' GPS. None: there is none of it.
+
+    Raises:
+        InputError: what the settings name cannot be found in the images.
+    """
+    from fieldfuse.poses import scaling
+
+    if not scaling.wanted(capture, settings.poses, poses.source == "sfm"):
+        return None
+    return scaling.find_scaling(capture, poses, settings.poses, progress)
 
 
 def find_effects(posed: Capture, settings: Settings, progress: Progress = SILENT) -> dict[str, Any]:

@@ -14,6 +14,7 @@ from fieldfuse.capture.images import HEADERS, cut_out
 from fieldfuse.capture.prepare import prepare_views
 from fieldfuse.capture.types import Frame
 from fieldfuse.config import CaptureSettings
+from fieldfuse.pipelines.info import see_through
 from tests.capture.board import texture
 from tests.capture.layouts import LAYOUTS
 
@@ -102,3 +103,12 @@ def test_one_of_many_with_alpha_and_files_that_are_damaged(tmp_path: Path) -> No
     assert cut_out(frames)
     frames[13].image.write_bytes(frames[13].image.read_bytes()[:60])  # a good header, and no pixels
     assert not cut_out(frames)
+
+
+def test_info_says_how_much_alpha_cuts_away(tmp_path: Path) -> None:
+    for index in range(3):
+        pixels = np.full((40, 50, 4), 255, np.uint8)
+        pixels[:, :40, 3] = 0
+        pixels[:, :, 0] = 60 * index
+        cv2.imwrite(str(tmp_path / f"{index}.png"), pixels)
+    assert see_through(open_capture(tmp_path)) == "cuts 80% of the images away (by 3 of 3)"

@@ -75,6 +75,19 @@ def test_channels_that_are_no_image_are_named(tmp_path: Path) -> None:
         read_exr(write_exr(tmp_path / "a.exr", planes("motion.x motion.y")))
 
 
+def test_other_primaries_become_srgbs(tmp_path: Path) -> None:
+    """ITU-R BT.2020's white and red, by the matrices of ITU-R BT.2087 and IEC 61966-2-1; sRGB's own stay exactly as they are."""
+    colours = {"R": np.float32([[1, 1]]), "G": np.float32([[1, 0]]), "B": np.float32([[1, 0]])}
+    bt2020 = (0.708, 0.292, 0.170, 0.797, 0.131, 0.046, 0.3127, 0.3290)
+    image = read_exr(write_exr(tmp_path / "a.exr", colours, chromaticities=bt2020))
+    assert image[0] == pytest.approx(np.array([[1, 1, 1], [1.6605, -0.1246, -0.0182]]), abs=1e-3)
+    srgb = (0.64, 0.33, 0.30, 0.60, 0.15, 0.06, 0.3127, 0.3290)
+    stored = planes("R G B")
+    assert np.array_equal(read_exr(write_exr(tmp_path / "b.exr", stored, chromaticities=srgb))[..., 2], stored["B"])
+    image = read_exr(write_exr(tmp_path / "c.exr", stored, chromaticities=(0.0,) * 8))
+    assert np.array_equal(image[..., 0], stored["R"])
+
+
 def window(left: int, top: int, right: int, bottom: int) -> tuple[Array, Array]:
     return np.array([left, top], np.int32), np.array([right, bottom], np.int32)
 

@@ -18,7 +18,7 @@ from fieldfuse.capture.checks import check_capture
 from fieldfuse.capture.headers import image_header, orientation_of, read_header, read_tiff, unturned
 from fieldfuse.capture.images import load_image, read_image, turns_by_exif
 from fieldfuse.capture.storage import capture_from_dict, capture_to_dict
-from fieldfuse.capture.types import Frame
+from fieldfuse.capture.types import CUT, Frame
 from fieldfuse.errors import InputError
 from tests.pipelines.made import make_room
 
@@ -192,18 +192,6 @@ def test_images_that_exif_turns_by_180_degrees_are_remarked(room: Path) -> None:
     assert not turns_by_exif(capture) and any("by 180°" in warning for warning in capture.warnings)
 
 
-def test_panoramas_are_refused_for_what_they_are(room: Path, tmp_path: Path) -> None:
-    xmp = b'<x:xmpmeta xmlns:x="adobe:ns:meta/"><GPano:ProjectionType>equirectangular</GPano:ProjectionType></x:xmpmeta>'
-    for number, path in enumerate(photos(tmp_path / "p", ".jpg", 6)):
-        Image.fromarray(np.repeat(scene(9 * number), 2, axis=1)).save(path, xmp=xmp)
-    with pytest.raises(InputError, match=r"panoramas .* are not read; cut each into perspective views"):
-        check_capture(open_capture(tmp_path / "p"))
-    path = room / "transforms.json"
-    path.write_text(json.dumps({**json.loads(path.read_text()), "camera_model": "EQUIRECTANGULAR"}))
-    with pytest.raises(InputError, match=r"panoramas .* are not read"):
-        open_capture(room)
-
-
 def test_views_that_were_cut_out_of_panoramas_pass(room: Path) -> None:
     """They may have kept its metadata, and come with cameras."""
     xmp = b'<x:xmpmeta xmlns:x="adobe:ns:meta/"><GPano:ProjectionType>equirectangular</GPano:ProjectionType></x:xmpmeta>'
@@ -221,6 +209,9 @@ def test_how_much_of_a_wide_lens_is_not_used_is_said(room: Path) -> None:
     path = room / "transforms.json"
     data = json.loads(path.read_text())
     path.write_text(json.dumps({**data, "camera_model": "OPENCV_FISHEYE", "fl_x": 45.0, "fl_y": 45.0, "k1": -0.03}))
-    assert any("outside of the pinhole view" in warning for warning in check_capture(open_capture(room)).warnings)
+    plain = check_capture(open_capture(room, projection="perspective"))
+    assert any("outside of the pinhole view" in warning for warning in plain.warnings) and CUT not in plain.extra
+    cut = check_capture(open_capture(room))
+    assert not any("outside of the pinhole view" in warning for warning in cut.warnings) and "8 fisheye pictures" in cut.extra[CUT]
     path.write_text(json.dumps({**data, "camera_model": "OPENCV", "k1": -0.02}))
     assert not any("outside of the pinhole view" in warning for warning in check_capture(open_capture(room)).warnings)

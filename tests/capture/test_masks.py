@@ -123,6 +123,39 @@ def test_dynamic_masks_leave_out_what_is_white(tmp_path: Path) -> None:
     assert kept(capture_from_dict(json.loads(json.dumps(capture_to_dict(capture))))) == kept(capture)
 
 
+def test_a_folder_of_dynamic_masks_leaves_out_what_is_white(tmp_path: Path) -> None:
+    write_transforms(tmp_path)
+    for frame in open_capture(tmp_path).frames:
+        save(tmp_path / "dynamic_masks" / f"{frame.image.stem}.png", half(left=20))
+    assert kept(open_capture(tmp_path)) == [0.75] * len(open_capture(tmp_path).frames)
+
+
+@pytest.mark.parametrize(("key", "share"), [("mask_path", 0.25), ("mask_file_path", 0.25), ("dynamic_mask_path", 0.75)])
+def test_masks_that_a_json_lists(tmp_path: Path, key: str, share: float) -> None:
+    write_transforms(tmp_path)
+    data = json.loads((tmp_path / "transforms.json").read_text())
+    for index, entry in enumerate(data["frames"][:-1]):
+        save(tmp_path / f"any/{index}.png", half(left=20))
+        entry[key] = f"any/{index}.png"
+    (tmp_path / "transforms.json").write_text(json.dumps(data))
+    capture = open_capture(tmp_path)
+    assert sorted(kept(capture)) == sorted([share] * (len(capture.frames) - 1) + [1.0])
+    assert f"a mask (listed by the capture), which leaves {100 * share:.0f}% of the pixels" in " ".join(capture.warnings)
+    assert {round(1 - one, 3) for one in kept(open_capture(tmp_path, "inverted"))} == {share, 0.0}
+    assert kept(open_capture(tmp_path, "off")) == [1.0] * len(capture.frames)
+
+
+@pytest.mark.parametrize("name", ["{stem}_mask.png", "{name}.mask.png"])
+@pytest.mark.parametrize("write", [write_transforms, write_blender, write_colmap_bin, write_llff])
+def test_masks_beside_the_images_of_any_layout(tmp_path: Path, write, name: str) -> None:
+    write(tmp_path)
+    before = open_capture(tmp_path)
+    for frame in before.frames:
+        save(frame.image.parent / name.format(stem=frame.image.stem, name=frame.image.name), half())
+    capture = open_capture(tmp_path)
+    assert (capture.kind, len(capture.frames)) == (before.kind, len(before.frames)) and kept(capture) == [0.5] * len(capture.frames)
+
+
 @pytest.mark.parametrize(
     "mask",
     [

@@ -242,7 +242,7 @@ def first(data: dict) -> dict:
         (lambda d: d.update(w=1e30), "image size"),
         (lambda d: d.update(w=-80), "image size"),
         (lambda d: d.update(w=60, h=80), "another shape"),
-        (lambda d: d.update(camera_model="EQUIRECTANGULAR"), "panoramas"),
+        (lambda d: d.update(camera_model="EQUIRECTANGULAR"), "a 360° panorama is twice as wide as high"),
         (lambda d: d.update(camera_model="MIRROR_BALL"), "not supported"),
         (lambda d: d.update(camera_model="OPENCV", k4=0.1), "k4"),
         (lambda d: d.update(applied_scale=0), "'applied_scale'"),

@@ -16,8 +16,9 @@ import pytest
 
 from fieldfuse.config import load_settings
 from fieldfuse.errors import InputError
+from fieldfuse.files import write_json
 from fieldfuse.pipelines.folder import RunFolder, is_run_folder
-from fieldfuse.pipelines.render_path import read_cameras
+from fieldfuse.pipelines.render_path import path_fps, read_cameras
 from tests.pipelines.made import CAMERA, Answer, call, circle, make_room, save_picture, shoot, spawn, write_transforms
 
 Capsys = pytest.CaptureFixture[str]
@@ -345,6 +346,13 @@ def test_full_disk(limit: int, tmp_path: Path) -> None:
         ('{"w": 8, "h": 8, "fl_x": 9, "frames": [{}]}', "transform_matrix"),
         ('{"w": 8, "h": 8, "frames": [{"transform_matrix": [[1,0,0,0],[0,1,0,0],[0,0,1,0],[0,0,0,1]]}]}', "focal"),
         ('{"fl_x": 8, "frames": [{"transform_matrix": [[1,0,0,0],[0,1,0,0],[0,0,1,0],[0,0,0,1]]}]}', "size"),
+        ('{"camera_path": []}', "lists no cameras"),
+        ('{"camera_path": [{"fov": 50}]}', "'render_width', 'render_height' and its 'fov'"),
+        ('{"render_width": 8, "render_height": 6, "camera_path": [{"fov": 180}]}', "between 0 and 180 degrees"),
+        ('{"render_width": 8, "render_height": 1e9, "camera_path": [{"fov": 50}]}', "size"),
+        ('{"render_width": 8, "render_height": 6, "camera_path": [{"fov": 50, "camera_to_world": [1, 0]}]}', "16 numbers"),
+        ('{"render_width": 8, "render_height": 6, "camera_path": [{"fov": 50, "camera_to_world": [' + "0," * 15 + "1]}]}", "camera 0"),
+        ('{"camera_type": "fisheye", "camera_path": [{"fov": 50}]}', "'fisheye' cameras cannot be rendered"),
     ],
 )
 def test_camera_files_to_render(text: str, words: str, tmp_path: Path) -> None:
@@ -358,6 +366,21 @@ def test_good_camera_file(tmp_path: Path) -> None:
     names, lenses, poses = read_cameras(tmp_path / "transforms.json")
     assert names[1] == "images/001.png" and lenses[0] == CAMERA
     np.testing.assert_allclose(poses, circle(3), atol=1e-12)
+
+
+def test_good_camera_path(tmp_path: Path) -> None:
+    """As nerfstudio has it: OpenGL's axes, the vertical angle."""
+    pose = np.diag([1.0, -1, -1, 1])
+    pose[:3, 3] = 1, 2, 3
+    frame = {"camera_to_world": pose.reshape(-1).tolist(), "fov": 90.0, "aspect": 1.5, "file_path": "door"}
+    write_json(tmp_path / "path.json", {"render_width": 60, "render_height": 40, "fps": 12, "seconds": 1, "camera_path": [frame]})
+    names, lenses, poses = read_cameras(tmp_path / "path.json")
+    assert names == ["door"] and path_fps(tmp_path / "path.json") == 12
+    assert (lenses[0].width, lenses[0].height, lenses[0].cx, lenses[0].cy) == (60, 40, 30, 20)
+    assert lenses[0].fy == pytest.approx(20) and lenses[0].fx == pytest.approx(20)
+    expected = np.eye(4)
+    expected[:3, 3] = 1, 2, 3
+    np.testing.assert_allclose(poses, expected[None], atol=1e-12)
 
 
 def test_a_run_folder_whose_name_is_not_utf8_is_refused(tmp_path: Path) -> None:

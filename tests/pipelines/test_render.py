@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import base64
 import json
 import os
 from dataclasses import replace
@@ -14,6 +15,7 @@ import pytest
 from fieldfuse.files import read_json, write_json
 from fieldfuse.pipelines.rendered import Picture, Pictures, depth_step, depth_steps, write_pngs
 from fieldfuse.poses.scene import Scene
+from tests.evaluation.driven import driven, until
 from tests.pipelines.made import call, circle, shoot
 from tests.pipelines.short import report
 
@@ -110,3 +112,31 @@ def test_depth_pictures_of_a_run_are_millimetres(done: Path) -> None:
 def test_render_refuses_what_it_cannot_do(done: Path, tmp_path: Path, capsys: Capsys) -> None:
     assert "orbit or test" in call(capsys, "render", done, "--views", "train").sentence()
     assert ".mp4" in call(capsys, "render", done, "--to", tmp_path / "x.gif").sentence()
+
+
+def test_a_path_of_the_page_is_rendered_as_the_page_shows_it(done: Path, tmp_path: Path, capsys: Capsys) -> None:
+    """In a browser: two views as key poses, what is downloaded is given to `--path`, and the first picture is what stood there."""
+    with driven((done / "exports" / "field.html").as_uri(), tmp_path, (400, 300)) as browser:
+        until(lambda: browser.run("!!window.fieldfuse"))
+        start = browser.run("fieldfuse.about.start")
+        test = read_json(done / "report.json")["evaluation"]["field"]["per_view"]
+        assert browser.run(f"fieldfuse.about.photos[{start}].name") not in {view["name"] for view in test}
+        assert browser.run("fieldfuse.tools.unit") == "m"
+        for shown in (start, 0):
+            browser.run(f"fieldfuse.to({shown})")
+            until(lambda: browser.run("!fieldfuse.walker.journey"))
+            browser.run("document.getElementById('add').click(), document.getElementById('seconds').value = 0.1")
+        (tmp_path / "path.json").write_text(browser.run("JSON.stringify(fieldfuse.tools.path())"))
+        lens = browser.run("fieldfuse.photoLens")
+        width, height = 48, round(48 * lens[1] / lens[0])
+        factor = width / lens[0]
+        view = f"{factor * lens[2]}, {factor * lens[3]}, {width / 2}, {height / 2}"
+        script = f"btoa(String.fromCharCode(...fieldfuse.picture(fieldfuse.about.photos[{start}].pose, [{view}], {width}, {height})))"
+        seen = np.frombuffer(base64.b64decode(browser.run(script)), np.uint8).reshape(height, width, 4)[..., :3]
+        assert not browser.errors
+    for to in (tmp_path / "pictures", tmp_path / "film.mp4"):
+        answer = call(capsys, "render", done, "--path", tmp_path / "path.json", "--to", to, "--image-size", width, "--json", "--quiet")
+        assert answer.code == 0 and json.loads(answer.out)["pictures"] == 3, answer.err
+    assert cv2.VideoCapture(str(tmp_path / "film.mp4")).get(cv2.CAP_PROP_FPS) == 30
+    rendered = cv2.imread(str(tmp_path / "pictures" / "0000_camera_0000.png"))[..., ::-1]
+    assert rendered.shape == seen.shape and 10 * np.log10(255**2 / ((rendered.astype(float) - seen) ** 2).mean()) > 30

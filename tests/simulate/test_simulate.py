@@ -13,7 +13,7 @@ import pytest
 import torch
 from safetensors.numpy import load_file
 
-from fieldfuse.camera import unproject
+from fieldfuse.camera import FISHEYE, Intrinsics, directions_of, pixel_grid, unproject
 from fieldfuse.capture import open_capture
 from fieldfuse.capture.checks import check_capture
 from fieldfuse.capture.ply_points import read_ply_points
@@ -230,3 +230,37 @@ def test_the_command_films_and_tells(tmp_path: Path, capsys: pytest.CaptureFixtu
         code, _, err = run(*arguments)
         assert code == 2 and sentence in err and len(err.strip().splitlines()) <= 3 and "Traceback" not in err
     assert not (tmp_path / "d").exists()
+
+
+def test_a_panorama_camera_films_the_whole_sphere_upright(tmp_path: Path) -> None:
+    folder = made(tmp_path / "capture", camera={"kind": "panorama", "width": 128, "height": 64})
+    capture = open_capture(folder)
+    assert capture.posed and json.loads((folder / "transforms.json").read_text())["camera_model"] == "EQUIRECTANGULAR"
+    truth = load_file(folder / "ground_truth" / "frames" / "000001.safetensors")
+    frame = capture.frames[1]
+    assert frame.intrinsics == Intrinsics.equirectangular(128, 64) and frame.world_from_camera is not None
+    assert abs(frame.world_from_camera[2, 2]) < 0.1  # it looks along the horizon
+    rays = directions_of(frame.intrinsics, pixel_grid(128, 64)) @ frame.world_from_camera[:3, :3].T
+    points = frame.world_from_camera[:3, 3] + rays * truth["depth"].reshape(-1, 1)
+    down, up = points[rays[:, 2] < -0.95], points[rays[:, 2] > 0.95]
+    assert np.median(np.abs(down[:, 2])) < 0.8 and np.ptp(np.round(up[:, 2], 3)) < 0.02  # floor or furniture below, the ceiling above
+
+
+def test_a_fisheye_camera_is_the_readers(tmp_path: Path) -> None:
+    folder = made(tmp_path / "capture", camera={"kind": "fisheye", "width": 64, "height": 48, "fov": 180})
+    camera = open_capture(folder).frames[0].intrinsics
+    assert camera is not None and camera.lens == FISHEYE and camera.fx == pytest.approx(64 / np.pi)
+
+
+@pytest.mark.parametrize(
+    ("rest", "message"),
+    [
+        ({"camera": {"kind": "panorama"}}, "a panorama is twice as wide as high"),
+        ({"camera": {"fov": 170}}, "a pinhole's fov is at most 140 degrees"),
+        ({"camera": {"kind": "fisheye"}, "depth": True}, "the depth camera is a pinhole"),
+        ({"camera": {"kind": "fisheye"}, "effects": ["vignetting"]}, "vignetting is listed, which is modelled for a pinhole camera only"),
+    ],
+)
+def test_what_does_not_go_with_a_camera_is_refused(tmp_path: Path, rest: dict[str, Any], message: str) -> None:
+    with pytest.raises(InputError, match=message):
+        simulate(scene_file(rest, "test"), tmp_path / "capture")

@@ -13,14 +13,18 @@ from fieldfuse.capture.types import Capture, Frame, Views
 __all__ = ["Capture", "Frame", "Views", "open_capture"]
 
 
-def open_capture(source: Path | str, masks: str = "auto", choose: Callable[[Sequence[Capture]], int] | None = None) -> Capture:
+def open_capture(
+    source: Path | str, masks: str = "auto", choose: Callable[[Sequence[Capture]], int] | None = None, projection: str = "auto"
+) -> Capture:
     """The capture at `source`: a video, a folder of a known layout, a `.sens` file, or one of a layout's JSON files. Found by looking.
 
     Args:
         masks: how masks beside the images are read: auto (black is excluded) | inverted | off.
+        projection: what the images are (`panorama.with_projection`).
         choose: which of the captures that several COLMAP models make is the right one; None: the one that most images fit by name and size.
 
-    Only listings, metadata and image headers are read; pixels are decoded of a video's first frame, and of a few images with alpha.
+    Only listings, metadata and image headers are read; pixels are decoded of a video's first frame, and of a few images with
+    alpha, or twice as wide as high.
 
     Raises:
         InputError: nothing there, nothing known, or the layout's own files are broken.
@@ -29,6 +33,7 @@ def open_capture(source: Path | str, masks: str = "auto", choose: Callable[[Sequ
     from fieldfuse.capture.colmap import model_captures
     from fieldfuse.capture.detect import read_source
     from fieldfuse.capture.masks import with_masks
+    from fieldfuse.capture.panorama import with_projection
     from fieldfuse.capture.photos import with_remark
     from fieldfuse.capture.poses import lenient_poses
     from fieldfuse.capture.usable import turned_by_exif, with_usable_poses
@@ -39,4 +44,4 @@ def open_capture(source: Path | str, masks: str = "auto", choose: Callable[[Sequ
             remark = "of several COLMAP models the one is used whose poses fit the images best"
             capture = others[best].with_frames(others[best].frames, remark)
         capture = with_usable_poses(capture, notes)
-        return with_remark(with_masks(turned_by_exif(capture), masks))
+        return with_projection(with_remark(with_masks(turned_by_exif(capture), masks)), projection)

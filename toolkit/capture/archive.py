@@ -30,7 +30,7 @@ def archive_of(path: Path) -> Path | None:
 
 def members(archive: Path) -> list[str]:
     """Names of everything in a zip file."""
-    return _opened(archive).namelist()
+    return open_archive(archive).namelist()
 
 
 def read_bytes(path: Path) -> bytes:
@@ -55,7 +55,7 @@ def read_member(path: Path, most: int = MOST_BYTES) -> bytes:
     archive = archive_of(path)
     if archive is None:
         raise InputError(f"cannot read {path}: it does not lie in a zip file; check the name")
-    opened, name = _opened(archive), path.relative_to(archive).as_posix()
+    opened, name = open_archive(archive), path.relative_to(archive).as_posix()
     try:
         size = opened.getinfo(name).file_size  # bounds what is inflated
         if size > most:
@@ -69,7 +69,12 @@ def read_member(path: Path, most: int = MOST_BYTES) -> bytes:
         raise InputError(f"{path} cannot be read ({first_line(error)}); copy or export {archive.name} again") from error
 
 
-def _opened(archive: Path) -> zipfile.ZipFile:
+def open_archive(archive: Path) -> zipfile.ZipFile:
+    """An open zip file.
+
+    Raises:
+        InputError: it cannot be read, or is none.
+    """
     try:
         stat = archive.stat()
         return _cached(archive, stat.st_size, stat.st_mtime_ns)

@@ -12,17 +12,17 @@ from pathlib import Path
 import cv2
 import numpy as np
 
-from fieldfuse.camera import Array, pinhole_share
+from fieldfuse.camera import EQUIRECTANGULAR, FISHEYE, Array, pinhole_share
 from fieldfuse.capture import heif
 from fieldfuse.capture.archive import read_bytes
 from fieldfuse.capture.calibration import fitted
 from fieldfuse.capture.depth_checks import check_depth
-from fieldfuse.capture.headers import LYING, PANORAMA, Header, is_panorama, read_header, unturned
+from fieldfuse.capture.headers import LYING, Header, read_header, unturned
 from fieldfuse.capture.images import read_image, spread, turns_by_exif, upright
 from fieldfuse.capture.light import with_white
 from fieldfuse.capture.listing import counted, natural_key, some_of, unique_names
 from fieldfuse.capture.photos import size_from_exif
-from fieldfuse.capture.types import Capture, Frame
+from fieldfuse.capture.types import CUT, Capture, Frame
 from fieldfuse.capture.usable import with_usable_depth, without
 from fieldfuse.errors import InputError
 from fieldfuse.progress import SILENT, Progress
@@ -87,7 +87,10 @@ def check_capture(capture: Capture, progress: Progress = SILENT) -> Capture:
             f"all {len(capture.frames)} images in {capture.root} show the same view; depth needs a camera that moves, "
             "take each image from another place"
         )
-    double = {**exact, **_copies([look for look in looks if look.deviation >= FLAT and look.frame.image not in exact], headers)}
+    cut = {frame.image for frame in capture.frames if frame.instant is not None}  # views of the sky, or a ceiling, look alike
+    exact = {image: other for image, other in exact.items() if image not in cut}
+    some = [look for look in looks if look.deviation >= FLAT and look.frame.image not in cut and look.frame.image not in exact]
+    double = {**exact, **_copies(some, headers)}
     copy_warnings = []
     if double:
         capture, remark = _once_each(capture, double)
@@ -97,7 +100,8 @@ def check_capture(capture: Capture, progress: Progress = SILENT) -> Capture:
     sizes = Counter(_upright_size(headers[frame.image], turns_by_exif(capture)) for frame in capture.frames)
     warnings = [*_size_warnings(capture, sizes), *_shape_warnings(capture, headers), *_lens_warnings(capture), *copy_warnings]
     warnings += _image_warnings(capture, looks)
-    warnings += check_depth(capture, progress)
+    capture, remarks = check_depth(capture, progress)
+    warnings += remarks
     extra = {**capture.extra, "sizes": {f"{width}x{height}": number for (width, height), number in sizes.most_common()}}
     new = [warning for warning in warnings if warning not in capture.warnings]
     return replace(capture, extra=extra, warnings=(*capture.warnings, *new))
@@ -123,8 +127,6 @@ def _look_at_all(capture: Capture, progress: Progress) -> tuple[Capture, dict[Pa
         try:
             data = read_bytes(frame.image)
             header = read_header(data, frame.image)
-            if is_panorama(data, header, frame.intrinsics is not None):
-                raise InputError(f"{frame.image}: {PANORAMA}")
             if not headers:
                 # Entropy decoding of a JPEG costs about a third of a PNG's, whatever size it is reduced to.
                 cost = header.width * header.height * len(capture.frames) * (0.35 if header.format in ("JPEG", "MPO") else 1.0)
@@ -218,7 +220,7 @@ def _upright_size(header: Header, exif: bool) -> tuple[int, int]:
 
 
 def _size_warnings(capture: Capture, sizes: Counter[tuple[int, int]]) -> list[str]:
-    if len(sizes) == 1:
+    if len(sizes) == 1 or all(frame.instant is not None for frame in capture.frames):
         return []
     listed = some_of([f"{width}×{height} ({number})" for (width, height), number in sizes.most_common()], 4)
     if all(frame.intrinsics is not None for frame in capture.frames):
@@ -244,7 +246,12 @@ def _shape_warnings(capture: Capture, headers: dict[Path, Header]) -> list[str]:
 
 def _lens_warnings(capture: Capture) -> list[str]:
     """That much of a wide lens's image lies outside of the pinhole image that is made of it."""
-    cameras = {frame.intrinsics for frame in capture.frames if frame.intrinsics is not None and frame.intrinsics.distorted}
+    cut = (FISHEYE, EQUIRECTANGULAR) if CUT in capture.extra else ()
+    cameras = {
+        frame.intrinsics
+        for frame in capture.frames
+        if frame.intrinsics is not None and frame.intrinsics.distorted and frame.intrinsics.lens not in cut
+    }
     shares = [pinhole_share(camera) for camera in cameras]
     if not shares or min(shares) > 1 - CUT_OFF:
         return []

@@ -32,6 +32,7 @@ from fieldfuse.threads import share
 VERSION = 2  # of what is written
 QUALITY = 97  # of the JPEG files, as of a video's frames
 MOST_AT_ONCE, PIXELS_AT_ONCE = 8, 200e6  # images, and their pixels, on their way at a time: a pixel takes about ten bytes
+RAW_TIMES = 3  # as much memory a pixel takes to be developed
 CONVERTED = "converted"  # in `Capture.extra`: how many images were
 MARKER = "converted.json"  # beside them: what each was made of
 TURNS = {3: (-1, 0), 6: (0, 1), 8: (0, -1)}  # EXIF orientation → cosine and sine of the turn from the upright image to the stored one
@@ -70,7 +71,7 @@ def convert_images(capture: Capture, out: Path, threads: int, progress: Progress
     capture = with_white(capture, progress)
     folder = Path(out) / "frames"
     names = unique_names([capture.frames[i].image for i in indices])
-    done = _still_good(folder, {name: _state(capture.frames[i]) for name, i in zip(names, indices, strict=True)})
+    done = still_good(folder, {name: _state(capture.frames[i]) for name, i in zip(names, indices, strict=True)})
     finished = 0
 
     def convert(one: tuple[str, int]) -> tuple[int, Path]:
@@ -82,7 +83,8 @@ def convert_images(capture: Capture, out: Path, threads: int, progress: Progress
         progress.update(finished, len(indices), f"{finished} of {counted(len(indices), 'image')} as JPEG")
         return index, path.resolve()
 
-    largest = max((math.prod(image_header(capture.frames[i].image).size) for i in indices), default=1)
+    images = [capture.frames[i].image for i in indices]
+    largest = max((math.prod(image_header(image).size) * (RAW_TIMES if is_raw(image) else 1) for image in images), default=1)
     at_once = max(1, min(threads, MOST_AT_ONCE, int(PIXELS_AT_ONCE / largest)))
     written = dict(share(convert, list(zip(names, indices, strict=True)), at_once))
     as_shown: dict[str, Any] = {"white": None, "linear": None, "balance": None}
@@ -97,8 +99,12 @@ def _state(frame: Frame) -> str:
 
 
 def write_image(frame: Frame, target: Path) -> Path:
-    """Write a frame's image, upright, as `target` with `.jpg` added, or `.png` where it has alpha, and return that path."""
-    source, image = frame.image, upright(*read_image(frame))
+    """Write a frame's image, upright, as `save_image` does, and return its path."""
+    return save_image(upright(*read_image(frame)), target, frame.image)
+
+
+def save_image(image: Array, target: Path, source: Path) -> Path:
+    """Write (H, W, 3 or 4) uint8, made of the file `source`, as `target` with `.jpg` added, or `.png` where it has alpha; its path."""
     alpha = image.shape[2] == 4
     path = target.with_name(f"{target.name}.{'png' if alpha else 'jpg'}")
     order = cv2.COLOR_RGBA2BGRA if alpha else cv2.COLOR_RGB2BGR
@@ -110,7 +116,7 @@ def write_image(frame: Frame, target: Path) -> Path:
     return path
 
 
-def _still_good(folder: Path, wanted: dict[str, str]) -> dict[str, Path]:
+def still_good(folder: Path, wanted: dict[str, str]) -> dict[str, Path]:
     """Of the images wanted (name → state of its source) those that an earlier attempt left there; what it left of other sources is
     removed, and what is wanted is noted down."""
     marker = folder / MARKER

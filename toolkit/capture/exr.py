@@ -27,6 +27,7 @@ MOST_SIDE = 2**20  # pixels; windows are signed 32-bit numbers
 FAR = 1e9  # depth from here on is nothing: Blender writes 1e10 where no surface is
 DEPTH_NAMES = ("z", "depth", "distance")
 COLOURS, GREY = ("r", "g", "b"), ("y", "v", "grey", "gray", "luminance")
+SRGB = np.array([[0.64, 0.33], [0.30, 0.60], [0.15, 0.06], [0.3127, 0.3290]])  # red, green, blue, white
 _printing = threading.Lock()  # stdout is the whole process's
 
 
@@ -40,7 +41,8 @@ class ExrHeader:
 
 
 def read_exr(path: Path, *, depth: bool = False) -> Array:
-    """The image in an OpenEXR file, float32, values as stored: (H, W, 3) RGB, (H, W, 4) RGBA (premultiplied), or (H, W) of one channel.
+    """The image in an OpenEXR file, float32: (H, W, 3) RGB, (H, W, 4) RGBA (premultiplied), or (H, W) of one channel. Values are as stored;
+    colours of other primaries than sRGB's become those of sRGB.
 
     With `depth` always (H, W): the channel named Z or depth, else the only one, else that of three equal ones (a grey map saved in
     colour); 0 where nothing is (`FAR`, infinite, not a number).
@@ -55,6 +57,7 @@ def read_exr(path: Path, *, depth: bool = False) -> Array:
         found = {key: np.asarray(part.channels[name].pixels) for key, name in header.names.items()}
         (left, top), (right, bottom) = (np.asarray(corner).tolist() for corner in part.header["dataWindow"])
         (x, y), _ = (np.asarray(corner).tolist() for corner in part.header["displayWindow"])
+        chromaticities = part.header.get("chromaticities")
     if any(plane.shape != (bottom - top + 1, right - left + 1) for plane in found.values()):
         raise InputError(f"{path} is an OpenEXR file whose channels differ in size; save it anew, with all of one size")
     width, height = header.size
@@ -63,9 +66,13 @@ def read_exr(path: Path, *, depth: bool = False) -> Array:
     inside = out[rows, columns]
     for index, plane in enumerate(found.values()):
         inside[..., index] = plane[max(0, y - top) :, max(0, x - left) :][: inside.shape[0], : inside.shape[1]]
-    if not depth:
-        return out if len(found) > 1 else out[..., 0]
-    return _one_map(out, path)
+    if depth:
+        return _one_map(out, path)
+    if len(found) < 3:
+        return out[..., 0]
+    if (matrix := _to_srgb(chromaticities)) is not None:
+        out[..., :3] = out[..., :3] @ matrix.T
+    return out
 
 
 def exr_header(data: bytes, path: Path, *, depth: bool | None = None) -> ExrHeader:
@@ -134,6 +141,27 @@ def _depth_of(channels: list[str]) -> dict[str, str]:
 
 def _is_depth(name: str) -> bool:
     return any(part in DEPTH_NAMES for part in name.lower().split(".")[-2:])
+
+
+def _to_srgb(chromaticities: Any) -> Array | None:
+    """(3, 3) float32: linear colours of a file's primaries and white (CIE xy) → sRGB's; None where they are these already, or no colours.
+    White is not adapted, as in OpenEXR's own conversions."""
+    try:
+        xy = np.array(chromaticities, dtype=np.float64).reshape(4, 2)
+        if not np.isfinite(xy).all() or np.abs(xy - SRGB).max() < 1e-3:
+            return None
+        matrix = np.linalg.inv(_to_xyz(SRGB)) @ _to_xyz(xy)
+    except (TypeError, ValueError, np.linalg.LinAlgError, FloatingPointError):
+        return None
+    return matrix.astype(np.float32) if np.isfinite(matrix).all() and np.abs(matrix).max() < 100 else None
+
+
+def _to_xyz(xy: Array) -> Array:
+    """(3, 3): linear red, green and blue of these primaries → CIE XYZ, with Y = 1 for white."""
+    primaries = np.column_stack([xy, 1 - xy.sum(axis=1)]).T
+    with np.errstate(divide="raise", invalid="raise"):
+        white = primaries[:, 3] / primaries[1, 3]
+    return np.asarray(primaries[:, :3] * np.linalg.solve(primaries[:, :3], white))
 
 
 def _one_map(stored: Array, path: Path) -> Array:

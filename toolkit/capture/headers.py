@@ -21,7 +21,6 @@ from fieldfuse.capture.poses import reads_leniently
 from fieldfuse.errors import InputError
 
 MAX_PIXELS = 200_000_000
-PANORAMA = "360° panoramas (equirectangular) are not read; cut each into perspective views first, and give these"
 LYING = 5  # EXIF orientations from here on turn by 90°
 TIFFS = (".tif", ".tiff")
 WIDTH, HEIGHT, BITS, ORIENTATION, MAXIMUM, EXTRA, SAMPLE_FORMAT, PROFILE = 256, 257, 258, 274, 281, 338, 339, 34675  # tags of TIFF 6.0
@@ -147,13 +146,6 @@ def image_size(path: Path, others: Sequence[Path] = ()) -> tuple[int, int]:
     if size is None:
         raise InputError(f"{path} cannot be read as an image, and neither can the others beside it; check how they were written")
     return size
-
-
-def is_panorama(data: bytes, header: Header, posed: bool) -> bool:
-    """Whether the file has Google's photo sphere XMP (equirectangular). Of `posed` images only those twice as wide as high count: views
-    cut from a panorama may have kept its XMP."""
-    head = data[: 2**18]
-    return b"GPano:" in head and b"equirectangular" in head and (not posed or header.width == 2 * header.height)
 
 
 def orientation_of(path: Path) -> int:

@@ -27,6 +27,7 @@ from fieldfuse.tone import stored
 EXIF_TURNS = "exif_turns"  # in `Capture.extra`: the cameras are those of images that are turned by EXIF
 LOSSY = ("JPEG", "MPO", "WEBP", heif.FORMAT)  # formats whose black and white come out as greys
 LINEAR = (exr.FORMAT, raw.FORMAT)  # formats whose channels hold linear light
+ROWS = 256  # of an image that are converted at a time
 FEW_LEVELS = 32  # grey levels of a mask up to which they are labels, not soft edges
 HEADERS, IMAGES = 100, 5  # looked at at most, evenly spread: decoding all of a large capture would take minutes
 T = TypeVar("T")
@@ -203,18 +204,34 @@ def to_rgba(image: Array, white: float | None = None, *, linear: bool = False) -
         image = cv2.convertScaleAbs(image, alpha=255 / (white or 65535))
         if alpha is not None:
             image[..., 3:] = alpha >> 8
+    elif image.dtype != np.uint8 and linear:
+        image = _shown(image, white)
     elif image.dtype != np.uint8:
-        most = 65535.0 if image.dtype == np.uint16 else 1.0
-        top = white or most
-        finite = np.nan_to_num(image.astype(np.float32), nan=0.0, posinf=max(top, most), neginf=0.0)
-        image = stored(finite / top) if linear else np.round(np.clip(finite / top, 0, 1) * 255).astype(np.uint8)
-        if linear and image.ndim == 3 and image.shape[2] == 4:
-            image[..., 3] = np.round(np.clip(finite[..., 3] / most, 0, 1) * 255)
+        top = white or 1
+        finite = np.nan_to_num(image.astype(np.float32), nan=0.0, posinf=top, neginf=0.0)
+        image = np.round(np.clip(finite / np.float32(top), 0, 1) * 255).astype(np.uint8)
     if image.ndim == 3 and image.shape[2] == 1:
         image = image[:, :, 0]
     if image.ndim == 2:
         return np.asarray(cv2.cvtColor(image, cv2.COLOR_GRAY2RGB))
     return np.asarray(cv2.cvtColor(image, cv2.COLOR_BGRA2RGBA if image.shape[2] == 4 else cv2.COLOR_BGR2RGB))
+
+
+def _shown(image: Array, white: float | None) -> Array:
+    """Linear light, 16-bit or floating-point, with sRGB's curve: uint8. `white` (None: 65535, or 1) becomes 255; alpha is no light."""
+    alpha = image[..., 3:] if image.ndim == 3 and image.shape[2] == 4 else None
+    if image.dtype == np.uint16:
+        out = stored(np.arange(65536, dtype=np.float32) / np.float32(white or 65535))[image]
+        if alpha is not None:
+            out[..., 3:] = alpha >> 8
+        return out
+    out, top = np.empty(image.shape, np.uint8), np.float32(white or 1)
+    for start in range(0, len(image), ROWS):  # of a large image all at once would take fifty bytes a pixel
+        rows = image[start : start + ROWS].astype(np.float32)
+        out[start : start + ROWS] = stored(np.nan_to_num(rows / top, nan=0.0, posinf=1.0, neginf=0.0))
+    if alpha is not None:
+        out[..., 3:] = np.round(np.clip(np.nan_to_num(alpha), 0, 1) * 255)
+    return out
 
 
 def as_bgr(image: Array) -> Array:

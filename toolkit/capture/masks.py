@@ -62,7 +62,7 @@ def with_masks(capture: Capture, use: str = "auto") -> Capture:
         return capture
     remarks: list[str] = []
     frames = list(capture.frames)
-    place = ""
+    place = " (listed by the capture)"
     if all(frame.mask is None for frame in frames):
         try:
             found = _find(capture, remarks)
@@ -170,14 +170,18 @@ def _find(capture: Capture, remarks: list[str]) -> _Found | None:
         return match[1] if match else ""
 
     usual = factor(Counter(frame.image.parent.name for frame in capture.frames).most_common(1)[0][0])
-    best = None
+    best: _Found | None = None
     for place in sorted(places, key=lambda place: (-len(places[place]), factor(names[place]) != usual, len(names[place]))):
         masks, name = places[place], names[place]
-        if masks and best is None and not _show_masks([masks[index] for index in sorted(masks)]):
+        marks = [path.stem if place in among else f"{name} {path.stem}" for path in masks.values()]
+        excludes = sum(INVERTED in words_of(mark) for mark in marks) > len(marks) / 2
+        of_others = best is not None and best.excludes == excludes and not best.masks.keys() & masks.keys()
+        if masks and (best is None or of_others) and not _show_masks([masks[index] for index in sorted(masks)]):
             remarks.append(f"what lies in {name} is not used: it is neither black and white nor has it alpha, as masks do")
         elif masks and best is None:
-            marks = [path.stem if place in among else f"{name} {path.stem}" for path in masks.values()]
-            best = _Found(masks, name, sum(INVERTED in words_of(mark) for mark in marks) > len(marks) / 2)
+            best = _Found(masks, name, excludes)
+        elif masks and best is not None and of_others:  # of another split or camera
+            best = _Found({**best.masks, **masks}, f"{best.place} and {name}", excludes)
         elif place not in among or masks:
             why = "other masks are" if masks else "their names fit no image"
             remarks.append(f"the masks in {name} are not used: {why}")

@@ -14,7 +14,7 @@ import numpy as np
 
 from fieldfuse.camera import FISHEYE, OPENCV, PINHOLE, Array, Intrinsics, unproject, world_from_opengl
 from fieldfuse.capture.calibration import fitted, usable_size
-from fieldfuse.capture.headers import PANORAMA, UNREADABLE, image_header
+from fieldfuse.capture.headers import UNREADABLE, image_header
 from fieldfuse.capture.images import read_image, spread
 from fieldfuse.capture.listing import counted, number
 from fieldfuse.capture.poses import checked_pose
@@ -22,10 +22,12 @@ from fieldfuse.capture.resolve import CaptureFiles
 from fieldfuse.capture.types import Frame
 from fieldfuse.errors import InputError
 
-PANORAMAS = ("EQUIRECTANGULAR", "SPHERICAL", "VR180_L", "VR180_R", "OMNIDIRECTIONALSTEREO_L", "OMNIDIRECTIONALSTEREO_R")
+PANORAMAS = ("EQUIRECTANGULAR", "SPHERICAL")
+STEREO = ("VR180_L", "VR180_R", "OMNIDIRECTIONALSTEREO_L", "OMNIDIRECTIONALSTEREO_R")
 # nerfstudio and instant-ngp apply coefficients of pinhole cameras too, so a file that has some was made for that.
 FISHEYES = ("OPENCV_FISHEYE", "FISHEYE")
 MODELS = ("OPENCV", "SIMPLE_RADIAL", "RADIAL", "FULL_OPENCV", "PERSPECTIVE", "PINHOLE", "SIMPLE_PINHOLE", *FISHEYES)
+PANORAMA_SHAPE = 0.01  # by which a panorama's width may differ from twice its height
 SAME_FACTOR = 0.1  # how far a principal point may lie from a larger image's centre to be taken for it
 SQUARE = 1.15  # ratio of the focal lengths up to which pixels are nearly square
 FOCALS = (0.1, 50.0)  # of an image's longer side: focal lengths that cameras have
@@ -171,8 +173,13 @@ def _camera(shared: Mapping[str, Any], entry: Mapping[str, Any], size: tuple[int
             raise InputError(f"{where}: the camera angle is {angle:g}, it must lie between 0 and π; correct it")
         return 0.5 * length / math.tan(0.5 * angle)
 
-    flags = []
+    flags = list[str]()
     width, height = usable_size(value("w") or size[0], value("h") or size[1], where)
+    name = entry.get("camera_model", shared.get("camera_model"))
+    if str(name).upper() in PANORAMAS:  # as in nerfstudio: the middle looks along the camera's axis; focal lengths mean nothing
+        if abs(width / (2 * height) - 1) > PANORAMA_SHAPE:
+            raise InputError(f"{where}: a 360° panorama is twice as wide as high, this one is {width}×{height}; correct its camera model")
+        return Intrinsics.equirectangular(width, height), flags
     fx, fy, cx, cy = value("fl_x"), value("fl_y"), value("cx"), value("cy")
     if fx is None and fy is None and (other := _other_keys(value, width, height)) is not None:
         fx, fy, cx, cy = other
@@ -189,7 +196,6 @@ def _camera(shared: Mapping[str, Any], entry: Mapping[str, Any], size: tuple[int
         cx = cy = None
         flags.append("centred")
     cx, cy = (width / 2 if cx is None else cx), (height / 2 if cy is None else cy)
-    name = entry.get("camera_model", shared.get("camera_model"))
     if name is None:
         name = "OPENCV_FISHEYE" if entry.get("is_fisheye", shared.get("is_fisheye", False)) else "OPENCV"
     lens, distortion = _lens(str(name), value, where)
@@ -240,8 +246,8 @@ def _unswapped(across: float | None, down: float | None, width: int, height: int
 
 
 def _lens(name: str, value: Callable[[str], float | None], where: str) -> tuple[str, tuple[float, ...]]:
-    if name.upper() in PANORAMAS:
-        raise InputError(f"{where}: {PANORAMA}")
+    if name.upper() in STEREO:
+        raise InputError(f"{where}: the camera model {name[:40]!r} is half of a stereo pair, which is not read; give plain panoramas")
     if name.upper() not in MODELS:
         raise InputError(f"{where}: the camera model {name[:40]!r} is not supported; undistort the images to PINHOLE or OPENCV first")
     k1, k2, k3, k4, k5, k6, p1, p2 = (value(key) or 0.0 for key in ("k1", "k2", "k3", "k4", "k5", "k6", "p1", "p2"))

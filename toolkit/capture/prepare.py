@@ -27,29 +27,40 @@ _MAX_SAMPLES = 4  # samples a pixel and side taken through the lens; what shrink
 def held_out(capture: Capture, holdout: int) -> Array:
     """(N,) bool, True for test views: the source's own split when it has one, else every `holdout`-th frame by name (0, n, 2n, …).
 
-    A `holdout` of 0 gives no test views, unless the source has a split. Training images alone (a `transforms_train.json` without others)
-    are no split.
+    Views that were cut out of one image are held out together: what one shows, its neighbour may show too. A `holdout` of 0 gives no test
+    views, unless the source has a split. Training images alone (a `transforms_train.json` without others) are no split.
     """
     frames = capture.frames
     if any(frame.split == "test" for frame in frames):
         return np.array([frame.split == "test" for frame in frames], dtype=bool)
     test = np.zeros(len(frames), dtype=bool)
     if holdout > 0:
-        order = sorted(range(len(frames)), key=lambda index: natural_key(frames[index].name))
-        test[order[::holdout]] = True
+        for group in instants(capture)[::holdout]:
+            test[group] = True
     return test
 
 
+def instants(capture: Capture, among: Iterable[int] | None = None) -> list[list[int]]:
+    """Indices of the frames (all, or `among` them) by name, those of one instant together."""
+    groups: dict[str, list[int]] = {}
+    for index in range(len(capture.frames)) if among is None else among:
+        frame = capture.frames[index]
+        groups.setdefault(frame.name if frame.instant is None else frame.instant, []).append(index)
+    return [groups[name] for name in sorted(groups, key=natural_key)]
+
+
 def limited(capture: Capture, holdout: int, limit: int | None) -> Capture:
-    """`limit` evenly spread training images by name (all when there are no more), and every held-out one; the others are excluded.
+    """`limit` evenly spread training images by name (all when there are no more), and every held-out one; the others are excluded. Views of
+    one instant stay together, of one at least.
 
     Held-out images are the same whatever the limit is.
     """
     test = held_out(capture, holdout)
-    train = sorted(np.flatnonzero(~test).tolist(), key=lambda index: natural_key(capture.frames[index].name))
+    train = np.flatnonzero(~test).tolist()
     if limit is None or limit >= len(train):
         return capture
-    stay = {train[place] for place in evenly(len(train), limit)}
+    groups = instants(capture, train)
+    stay = {index for place in evenly(len(groups), max(1, limit * len(groups) // len(train))) for index in groups[place]}
     return capture.with_frames(
         replace(frame, split="test" if test[index] else "train")  # with fewer frames every n-th is another
         for index, frame in enumerate(capture.frames)

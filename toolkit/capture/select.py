@@ -15,6 +15,7 @@ from fieldfuse.camera import Array
 from fieldfuse.capture.checks import check_capture
 from fieldfuse.capture.film import DEPTH, QUALITY, Film
 from fieldfuse.capture.listing import counted
+from fieldfuse.capture.sphere import to_cut, views_of
 from fieldfuse.capture.types import Capture
 from fieldfuse.capture.video import UNCOUNTED
 from fieldfuse.config import CaptureSettings
@@ -37,6 +38,7 @@ BLURRED = 0.6  # of the sharpness around it: a frame that may be excluded
 MEASURED = 1200  # frames of a long video that are measured, evenly spread: converting one of 3840×2160 takes longer than decoding it …
 MEASURED_A_SECOND = 10  # … but never fewer, so that what is seen in one is still seen in the next
 INTERLACED = ", or, since all frames come out alike, convert it if it is interlaced, as camcorders' are, which cannot be read"
+FEWEST_CUT = 24  # frames of a 360° video, at least, if there are so many
 JUMP = 0.30  # motion booked where tracking fails (a cut, a blank wall, strong blur)
 
 
@@ -87,7 +89,10 @@ def select_frames(capture: Capture, out: Path, settings: CaptureSettings, progre
             f"the camera does not move in the video {video}; depth needs views from different places, film while walking around the scene"
             f"{alike}"
         )
-    best = choose(measure, settings.max_frames)
+    most = settings.max_frames
+    if cut := to_cut(capture):  # each becomes several images, of which half would show as much
+        most = max(FEWEST_CUT, 2 * most // len(views_of(capture.frames[cut[0]].intrinsics)[0]))
+    best = choose(measure, most)
     folder = Path(out) / "frames"
     chosen = {number: folder / f"frame_{number:06d}.jpg" for number in (best if wanted is None else [wanted[index] for index in best])}
     _write(film, chosen, last + 1, progress)

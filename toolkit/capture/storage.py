@@ -19,7 +19,8 @@ from fieldfuse.files import atomic_path
 from fieldfuse.tone import Tone
 
 VERSION = 1
-PATHS, CAMERAS, POSES = ("image", "depth", "mask", "confidence"), ("intrinsics", "depth_intrinsics"), ("world_from_camera", "depth_pose")
+PATHS, CAMERAS = ("image", "depth", "mask", "confidence"), ("intrinsics", "depth_intrinsics")
+POSES = ("world_from_camera", "depth_pose", "source_from_view")
 FLAGS = ("mask_excludes", "mask_is_alpha", "as_stored")
 OPTIONAL: tuple[tuple[str, str, type, tuple[int, ...]], ...] = (  # lists of `Views`, and the name, type and channels in the file
     ("valid", "valid", np.bool_, ()),
@@ -89,7 +90,7 @@ def _plain(value: Any) -> Any:
 
 def _frame(data: dict[str, Any]) -> Frame:
     given = {key: value for key, value in data.items() if value is not None}
-    values: dict[str, Any] = {key: given.get(key) for key in ("split", "video_index", "focal_prior")}
+    values: dict[str, Any] = {key: given.get(key) for key in ("split", "video_index", "focal_prior", "instant")}
     values |= {key: Path(given[key]) for key in PATHS if key in given}
     values |= {key: Intrinsics.from_dict(given[key]).checked("the stored capture") for key in CAMERAS if key in given}
     values |= {key: np.array(given[key], dtype=np.float64).reshape(4, 4) for key in POSES if key in given}

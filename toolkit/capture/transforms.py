@@ -24,6 +24,7 @@ from fieldfuse.capture.types import Capture, Frame
 from fieldfuse.errors import InputError
 
 NAME = "transforms.json"
+MASKS, DYNAMIC = ("mask_path", "mask_file_path"), "dynamic_mask_path"  # keys of masks; the latter: what is white moves, and is excluded
 
 
 def looks_like_transforms(path: Path) -> bool:
@@ -51,16 +52,24 @@ def read_transforms(path: Path | str, within: Path | None = None) -> Capture:
     used = [entries[index] for index in there]
     images = [frame.image for frame in frames]
     beside: list[list[Path | None]] = []
-    for what, keys, kind in (("depth image", ("depth_file_path", "depth_path"), DEPTH), ("mask", ("mask_path",), MASK)):
+    for what, keys, kind in (("depth image", ("depth_file_path", "depth_path"), DEPTH), ("mask", (*MASKS, DYNAMIC), MASK)):
         names = nerf_json.listed_names(used, keys, json_path)
         found, found_remarks = folder.find_beside(names, kind, images, json_path.name, base)
         gone = found.count(None) - names.count(None)
         remarks += [f"{counted(gone, f'listed {what}')} not found"] if gone else []
         remarks += found_remarks
         beside.append(found)
+    dynamic = [all(entry.get(key) is None for key in MASKS) and entry.get(DYNAMIC) is not None for entry in used]
     frames = [
-        replace(frame, depth=depth, depth_intrinsics=_depth_camera(frame, depth), mask=mask, split=splits.get(_plain(entry["file_path"])))
-        for frame, entry, depth, mask in zip(frames, used, *beside, strict=True)
+        replace(
+            frame,
+            depth=depth,
+            depth_intrinsics=_depth_camera(frame, depth),
+            mask=mask,
+            mask_excludes=mask is not None and excludes,
+            split=splits.get(_plain(entry["file_path"])),
+        )
+        for frame, entry, excludes, depth, mask in zip(frames, used, dynamic, *beside, strict=True)
     ]
     frames, copies = nerf_json.once_each(frames)
     extra: dict[str, Any] = {"listed": len(entries), "missing": len(entries) - len(there)}

@@ -12,6 +12,7 @@ import numpy as np
 from fieldfuse.camera import Array, Intrinsics
 from fieldfuse.tone import Tone
 
+CUT = "cut"  # in `Capture.extra`: into what views images are cut, in a sentence (`sphere`)
 SAME_EXPOSURE = 1e-3  # gains are written with six digits, and their mean is 1 by no more
 
 
@@ -37,6 +38,10 @@ class Frame:
     depth_pose: Array | None = None  # (4, 4) image's camera from the depth camera, units of the poses; None: both at the same place
     mask_excludes: bool = False  # the mask is the other way round: what is not 0 is not used
     mask_is_alpha: bool = False  # nothing is there where the mask is 0, as the image shows: it is cut out
+    # Of a view that was cut out of a panorama or a fisheye image (`sphere`): that image's name, of which all views have one place and time,
+    # and (4, 4) its camera from the view's
+    instant: str | None = None
+    source_from_view: Array | None = None
 
 
 @dataclass(frozen=True)

@@ -1,17 +1,19 @@
 """`field.html`: a baked field and what draws it in one file, for whatever browser has WebGL 2: to walk through, to keep, to send.
 
-The page holds only what cannot be worked out (occupied voxels, a byte of density and sixteen of features a corner, the decoder), deflated;
-the scripts in `web/` unpack it and march through it as `backends/numba/march.py` does. It asks no server for anything.
+The page holds only what cannot be worked out (occupied voxels, a byte of density and sixteen of features a corner as `corners.py` writes
+them, the decoder), deflated; the scripts in `web/` unpack it and march through it as `backends/numba/march.py` does. It asks no server
+for anything.
 """
 
 from __future__ import annotations
 
 import base64
+import itertools
 import json
 import math
 import zlib
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from importlib import resources
 from pathlib import Path
 from typing import Any
@@ -21,8 +23,9 @@ import numpy as np
 from jinja2 import Environment, StrictUndefined
 
 from fieldfuse import __version__
-from fieldfuse.camera import Array, Intrinsics
+from fieldfuse.camera import Array, Intrinsics, Similarity
 from fieldfuse.errors import InputError
+from fieldfuse.export.corners import corner_differences, written_corners
 from fieldfuse.files import atomic_path
 from fieldfuse.nerfusion.decoder import Deferred
 from fieldfuse.nerfusion.encoding import BEHIND, DIRECTION, SH
@@ -35,7 +38,7 @@ CHANNELS, HIDDEN = 16, 96  # at most: what lies in one word of four, and, in thi
 WHOLE = 12  # hidden units are a multiple of it: three parts of rows, four units a vector
 INPUTS = CHANNELS + DIRECTION  # of the decoder: features and harmonics
 NEAREST_DEPTH, FARTHEST_DEPTH = 0.6, 2.5  # of the median depth: the range of depth's colours
-SCRIPTS = ("unpack.js", "draw.js", "walk.js", "page.js")
+SCRIPTS = ("unpack.js", "draw.js", "walk.js", "frame.js", "tools.js", "vr.js", "page.js")
 
 
 @dataclass(frozen=True)
@@ -48,6 +51,11 @@ class Tour:
         path: (F, 4, 4) closed.
         depth: median depth of the scene, working units: how far away what is looked at is taken to be.
         exposure: colours are shown brighter by it (`fieldfuse.tone.brighter`).
+        start: the photo at which a visitor begins.
+        working_from_input: what is measured, cropped, saved and shared is in the input's frame.
+        metric: its unit is a metre.
+        region: (3,) lowest and (3,) highest corner of what matters, working frame: a crop box begins there.
+        inside: a drag looks around, as in a room, and does not turn about what is in the middle.
     """
 
     names: Sequence[str]
@@ -57,6 +65,11 @@ class Tour:
     path: Array
     depth: float
     exposure: float = 1.0
+    start: int = 0
+    working_from_input: Similarity = field(default_factory=Similarity.identity)
+    metric: bool = False
+    region: tuple[Array, Array] = (np.full(3, -1.0), np.full(3, 1.0))
+    inside: bool = False
 
 
 def require_page(field: Field) -> None:
@@ -97,11 +110,12 @@ def page(field: BakedField, tour: Tour, title: str) -> str:
         title=title,
         photos=len(tour.names),
         voxels=f"{field.voxels:,}",
+        unit="metres" if tour.metric else "units",
         style=raw(_source("style.css")),
         about=raw(quoted),
         march=raw(_source("march.frag")),
         decode=raw(_source("decode.frag")),
-        field=raw(base64.b64encode(zlib.compress(blob, 6)).decode("ascii")),
+        field=raw(base64.b64encode(_deflated(blob)).decode("ascii")),
         script=raw("\n".join(_source(name) for name in SCRIPTS)),
     )
 
@@ -114,8 +128,7 @@ def packed(field: BakedField, tour: Tour) -> tuple[dict[str, Any], bytes]:
         ("bits", np.ascontiguousarray(arrays.bits).view(np.uint8)),
         ("keys", (field.keys() - field.table_origin).astype(np.uint16)),
         ("bricks", arrays.bricks),
-        ("density", field.corner_densities()),
-        ("feature", _padded(np.asarray(arrays.feature), CHANNELS, 1)),
+        ("values", corner_differences(field, written_corners(field))),
         ("thickness", arrays.thickness.astype("<f4")),
         ("small", small.astype("<f4")),
         ("large", large.astype("<f4")),
@@ -128,6 +141,12 @@ def packed(field: BakedField, tour: Tour) -> tuple[dict[str, Any], bytes]:
     about = _about(field, tour)
     about["arrays"] = [[name, f"{array.dtype.kind}{array.dtype.itemsize}", array.size] for name, array in given]
     return about, bytes(blob)
+
+
+def _deflated(blob: bytes) -> bytes:
+    """Differences hardly repeat: their frequencies are all that helps, and runs in what else there is."""
+    how = zlib.compressobj(strategy=zlib.Z_RLE)
+    return how.compress(blob) + how.flush()
 
 
 def _width(field: BakedField) -> int:
@@ -172,16 +191,23 @@ def _about(field: BakedField, tour: Tour) -> dict[str, Any]:
     define |= {"MAX_STRETCH": f"{MAX_STRETCH:e}", "LONGEST": int(14 * space.extent / (4 * voxel)) + 32}
     define["SHOULDER"] = repr(SHOULDER)
     define |= {f"C{number}": repr(value) for number, value in enumerate(SH)}
+    frame = tour.working_from_input
+    corners = frame.inverse().points(np.array(list(itertools.product(*zip(*tour.region, strict=True)))))
     return {
         "define": define,
         "march": march,
         "sky": (sky if field.sky is None else np.asarray(field.sky, np.float64)).reshape(-1).tolist(),
         "table": list(field.arrays.table.shape[::-1]),
         "side": field.arrays.bricks.shape[0],
+        "channels": field.arrays.feature.shape[1],
         "depth": tour.depth,
         "exposure": tour.exposure,
         "range": [1 / (FARTHEST_DEPTH * tour.depth), 1 / (NEAREST_DEPTH * tour.depth)],
-        "start": int(np.argmin(tour.test)),  # the first that the fit saw
+        "start": tour.start,
+        "frame": {"scale": frame.scale, "turn": frame.rotation.reshape(-1).tolist(), "shift": frame.translation.tolist()},
+        "metric": tour.metric,
+        "region": [corners.min(0).tolist(), corners.max(0).tolist()],
+        "inside": tour.inside,
         "photos": [
             {"name": name, "lens": [c.width, c.height, c.fx, c.fy], "pose": _numbers(pose), "test": bool(test)}
             for name, c, pose, test in zip(tour.names, tour.lenses, tour.poses, tour.test, strict=True)
@@ -190,9 +216,14 @@ def _about(field: BakedField, tour: Tour) -> dict[str, Any]:
     }
 
 
+def _rounded(values: Array) -> list[float]:
+    """With as many digits as are worth it."""
+    return [float(f"{value:.7g}") for value in np.asarray(values).reshape(-1)]
+
+
 def _numbers(pose: Array) -> list[float]:
-    """Twelve of them, with as many digits as are worth it."""
-    values = [float(f"{value:.7g}") for value in np.asarray(pose)[:3].reshape(-1)]
+    """Twelve of them."""
+    values = _rounded(pose[:3])
     if not all(math.isfinite(value) for value in values):
         raise InputError("a camera's pose is not finite; find the poses again")
     return values

@@ -13,13 +13,13 @@ import cv2
 import numpy as np
 import pycolmap
 
-from fieldfuse.camera import Array
+from fieldfuse.camera import Array, directions_of
 from fieldfuse.capture.images import load_image, usable_pixels
 from fieldfuse.capture.types import Frame
 from fieldfuse.errors import InputError
 from fieldfuse.files import read_json, remove, write_json
 from fieldfuse.poses.job import SIFT, TOLERANCE, Job
-from fieldfuse.poses.pairs import coarse
+from fieldfuse.poses.pairs import COARSE, coarse
 from fieldfuse.poses.points import at_pixels
 
 CONTRAST = 0.014  # finds as many as COLMAP's own detector does with its threshold
@@ -127,6 +127,8 @@ def extract(job: Job, database: pycolmap.Database, report: Report) -> list[dict[
     todo = [i for i, image in enumerate(job.images) if image.name not in records or not database.exists_image(label(i))]
     done = len(job.images) - len(todo)
     report(done, len(job.images), f"features {done} of {len(job.images)}")
+    with pycolmap.DatabaseTransaction(database):
+        _write_rigs(job, database)
     for index, (record, keypoints, descriptors) in _features(job, todo):
         if not database.exists_image(label(index)):
             with pycolmap.DatabaseTransaction(database):
@@ -136,6 +138,7 @@ def extract(job: Job, database: pycolmap.Database, report: Report) -> list[dict[
         if done % 10 == 0 or done == len(job.images):
             write_json(job.records, list(records.values()))
         report(done, len(job.images), f"features {done} of {len(job.images)}")
+    _write_rig_frames(job, database)
     return [records[image.name] for image in job.images]
 
 
@@ -196,18 +199,65 @@ def label(index: int) -> str:
 
 
 def _write_image(job: Job, database: pycolmap.Database, index: int, record: dict[str, Any], keypoints: Array, descriptors: Array) -> None:
-    camera_id, rig_id = _camera(job, database, job.images[index], record["width"], record["height"])
+    of_rig = job.images[index].instant is not None
+    if of_rig:
+        camera_id, rig_id = job.view_cameras[index], 0
+    else:
+        camera_id, rig_id = _camera(job, database, job.images[index], record["width"], record["height"])
     image = pycolmap.Image(name=label(index), camera_id=camera_id)
     image_id = database.write_image(image)
-    frame = pycolmap.Frame()
-    frame.rig_id = rig_id
     image.image_id = image_id
-    frame.add_data_id(image.data_id)
-    database.write_frame(frame)
+    if not of_rig:
+        _write_frame(database, rig_id, [image])
     database.write_keypoints(image_id, keypoints)
     kind = pycolmap.FeatureExtractorType.SIFT if job.features == SIFT else pycolmap.FeatureExtractorType.UNDEFINED
     data = pycolmap.FeatureDescriptors(type=kind, data=np.ascontiguousarray(descriptors))
     database.write_descriptors(image_id, data)
+
+
+def _write_frame(database: pycolmap.Database, rig_id: int, images: list[pycolmap.Image]) -> None:
+    frame = pycolmap.Frame()
+    frame.rig_id = rig_id
+    for image in images:
+        frame.add_data_id(image.data_id)
+    database.write_frame(frame)
+
+
+def _write_rigs(job: Job, database: pycolmap.Database) -> None:
+    """Cameras and rigs of the job's instants, where they are not there yet; a rig has the id of its first camera."""
+    cameras = job.view_cameras
+    for views in job.instants:
+        first = cameras.get(views[0])
+        if first is None or database.exists_rig(first):
+            continue
+        rig = pycolmap.Rig(rig_id=first)
+        start = job.images[views[0]].source_from_view
+        for index in views:
+            own, turn = job.images[index].intrinsics, job.images[index].source_from_view
+            assert own is not None and turn is not None and start is not None
+            camera = pycolmap.Camera(
+                camera_id=cameras[index], model="PINHOLE", width=own.width, height=own.height, params=[own.fx, own.fy, own.cx, own.cy]
+            )
+            camera.has_prior_focal_length = True
+            if not database.exists_camera(camera.camera_id):
+                database.write_camera(camera, use_camera_id=True)
+            if index == views[0]:
+                rig.add_ref_sensor(camera.sensor_id)
+            else:
+                turned = pycolmap.Rotation3d((turn.T @ start)[:3, :3])
+                rig.add_sensor(camera.sensor_id, pycolmap.Rigid3d(turned, np.zeros(3)))
+        database.write_rig(rig, use_rig_id=True)
+
+
+def _write_rig_frames(job: Job, database: pycolmap.Database) -> None:
+    """The frames of the job's instants, where they are not there yet: their images are."""
+    cameras = job.view_cameras
+    there = {data.id for frame in database.read_all_frames() for data in frame.data_ids}
+    with pycolmap.DatabaseTransaction(database):
+        for views in job.instants:
+            images = [database.read_image_with_name(label(index)) for index in views if index in cameras]
+            if images and images[0].image_id not in there:
+                _write_frame(database, cameras[views[0]], images)
 
 
 def lens_model(images: int) -> str:
@@ -219,7 +269,10 @@ def _camera(job: Job, database: pycolmap.Database, frame: Frame, width: int, hei
     """The (camera, rig) ids for an image: shared by images of one size when the job has one camera."""
     focal = frame.focal_prior or GUESSED_FOCAL * max(width, height)
     if job.one_camera:
+        of_views = set(job.view_cameras.values())
         for rig in database.read_all_rigs():
+            if rig.rig_id in of_views:
+                continue
             camera = database.read_camera(rig.ref_sensor_id.id)
             if (camera.width, camera.height) == (width, height):
                 return camera.camera_id, rig.rig_id
@@ -236,13 +289,29 @@ def _camera(job: Job, database: pycolmap.Database, frame: Frame, width: int, hei
 
 
 def sketches(job: Job, database: pycolmap.Database) -> list[Array]:
-    """The coarsest descriptors of every image, for choosing pairs."""
+    """The coarsest descriptors of every image, for choosing pairs; of a view those of what no other view of its instant shows nearer to
+    its axis, so that nothing is there twice."""
     out = []
+    share = max((len(views) for views in job.instants), default=1)
     for index in range(len(job.images)):
         image_id = database.read_image_with_name(label(index)).image_id
         keypoints = np.asarray(database.read_keypoints(image_id)).reshape(-1, 4)
-        out.append(coarse(floats(database.read_descriptors(image_id).data, job.features), keypoints[:, 2]))
+        descriptors = floats(database.read_descriptors(image_id).data, job.features)
+        if index in job.view_cameras:
+            own = _nearest_axis(job, index, keypoints[:, :2])
+            keypoints, descriptors = keypoints[own], descriptors[own]
+        out.append(coarse(descriptors, keypoints[:, 2], COARSE if share == 1 else 3 * COARSE // share))
     return out
+
+
+def _nearest_axis(job: Job, index: int, pixels: Array) -> Array:
+    """(N,) bool: whether what a view shows at pixels (N, 2) lies nearer to its axis than to that of any other view of its instant."""
+    frame = job.images[index]
+    assert frame.intrinsics is not None and frame.source_from_view is not None
+    rays = directions_of(frame.intrinsics, pixels) @ frame.source_from_view[:3, :3].T
+    siblings = next(views for views in job.instants if index in views)
+    axes = np.array([turn[:3, 2] for i in siblings if (turn := job.images[i].source_from_view) is not None])
+    return np.asarray((rays @ axes.T).argmax(axis=1) == siblings.index(index))
 
 
 def pair_facts(database: pycolmap.Database) -> list[dict[str, Any]]:

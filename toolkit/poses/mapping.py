@@ -61,7 +61,7 @@ def map_images(job: Job, report: Report) -> tuple[Model | None, list[dict[str, A
         (GONE_ON, lambda: [] if best is None else _incremental(job, report, SMALL_ANGLE, best.reconstruction)),
         (GONE_FAR, lambda: [] if best is None else _incremental(job, report, TINY_ANGLE, best.reconstruction)),
         (LOOSE, lambda: _incremental(job, report, SMALL_ANGLE)),
-        (GLOBAL, lambda: _global(job, report)),
+        (GLOBAL, lambda: [] if job.rigged else _global(job, report)),
     ]
     best: Model | None = None
     history = []
@@ -112,7 +112,13 @@ def _better(model: Model, best: Model) -> bool:
 
 
 def _registered(reconstruction: pycolmap.Reconstruction) -> list[int]:
-    return sorted(i for i in reconstruction.reg_image_ids() if reconstruction.image(i).num_points3D >= FEW_POINTS)
+    """Ids of the images that see enough points; of a rig's, together."""
+    out = list[int]()
+    for frame_id in reconstruction.reg_frame_ids():
+        images = [reconstruction.image(data.id) for data in reconstruction.frame(frame_id).image_ids]
+        if sum(image.num_points3D for image in images) >= FEW_POINTS:
+            out += [image.image_id for image in images]
+    return sorted(out)
 
 
 def _options(job: Job, angle: float | None = None) -> pycolmap.IncrementalPipelineOptions:
@@ -133,6 +139,9 @@ def _options(job: Job, angle: float | None = None) -> pycolmap.IncrementalPipeli
         options.triangulation.merge_max_reproj_error = job.tolerance
         options.mapper.abs_pose_max_error *= job.tolerance / TOLERANCE
     options.ba_local_function_tolerance = options.ba_global_function_tolerance = STEP_TOLERANCE
+    if job.rigged:  # what is known of views is exact
+        options.ba_refine_sensor_from_rig = False
+        options.constant_cameras = set(job.view_cameras.values())
     if angle is not None:
         options.mapper.init_min_tri_angle = 4.0
         options.mapper.init_min_num_inliers = 40
@@ -224,6 +233,8 @@ def finish(job: Job, model: Model, report: Report) -> None:
     report(len(job.images), len(job.images), "adjusting all once more")
     options = pycolmap.BundleAdjustmentOptions()
     options.print_summary = False
+    if job.rigged:
+        options.refine_sensor_from_rig = options.refine_focal_length = options.refine_extra_params = False
     options.ceres.solver_options.function_tolerance = LAST_TOLERANCE
     options.ceres.solver_options.max_num_iterations = LAST_STEPS
     options.ceres.solver_options.num_threads = job.repeating
@@ -278,6 +289,9 @@ def _intrinsics(camera: pycolmap.Camera) -> Intrinsics:
     values = [float(value) for value in camera.params]
     if camera.model_name == "OPENCV":
         fx, fy, cx, cy, *lens = values
+    elif camera.model_name == "PINHOLE":
+        fx, fy, cx, cy = values
+        return Intrinsics(int(camera.width), int(camera.height), fx, fy, cx, cy)
     elif camera.model_name == "SIMPLE_RADIAL":
         fx, cx, cy, k = values
         fy, lens = fx, [k, 0.0, 0.0, 0.0]

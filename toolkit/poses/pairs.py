@@ -6,6 +6,7 @@ cost of matching all (preemptive matching, Wu 2013, "Towards linear-time increme
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Callable
 from itertools import combinations
 
@@ -24,6 +25,9 @@ FAR_STEPS = (20, 40, 80, 160)
 STEPS = (1, 2, 3, 5, 7, 10, *FAR_STEPS)
 EVERY_STEP = (*range(1, 11), *FAR_STEPS)
 FEW_FRAMES = 60  # up to which every step of the next ten is taken: frames lie far apart there, and each match counts
+BESIDE = 2  # instants from one to the other of which views that look the same way are matched whatever they share
+MIN_COMMON_VIEWS = 3  # coarse matches between two views, of instants that go together
+EACH_VIEW = 2  # views of another instant that one is matched with at most
 LOOPS = 3  # such pairs of a frame at most
 LOOP_GAP = 20  # frames apart before a pair counts as a loop
 LOOP_ANCHORS = 60  # frames of a video that are compared with each other to find loops
@@ -37,6 +41,9 @@ def choose_pairs(job: Job, sketches: Callable[[], list[Array]], report: Callable
         sketches: gives the coarsest descriptors of every image.
     """
     count = len(job.images)
+    if job.rigged:
+        report(0, count, "choosing pairs of views")
+        return view_pairs(job, sketches())
     if job.sequential:
         report(0, count, "looking for loops")
         return sorted({*sequential_pairs(count), *loop_pairs(sketches(), stride=max(1, -(-count // LOOP_ANCHORS)))})
@@ -44,6 +51,33 @@ def choose_pairs(job: Job, sketches: Callable[[], list[Array]], report: Callable
         return list(combinations(range(count), 2))
     report(0, count, "choosing pairs that look alike")
     return similar_pairs(sketches())
+
+
+def view_pairs(job: Job, sketches: list[Array]) -> Pairs:
+    """Pairs of views of different instants: of instants that go together (by order, by what they share, or all while these are few) those
+    views that share coarse features, and of neighbours also those that look the same way."""
+    groups, count = job.instants, len(job.instants)
+    whole = [np.concatenate([sketches[index] for index in views]) for views in groups]
+    owner = [np.concatenate([np.full(len(sketches[index]), index) for index in views]) for views in groups]
+    if job.sequential:
+        loops = loop_pairs(whole, stride=max(1, -(-count // LOOP_ANCHORS)))
+        together = sorted({*sequential_pairs(count, STEPS), *loops})
+    elif count <= MAX_EXHAUSTIVE:
+        together = list(combinations(range(count), 2))
+    else:
+        together = similar_pairs(whole)
+    pairs = set[tuple[int, int]]()
+    for one, other in together:
+        matched = matches_of(whole[one], whole[other])
+        shared = Counter(zip(owner[one][matched[:, 0]].tolist(), owner[other][matched[:, 1]].tolist(), strict=True))
+        best = Counter[int]()
+        for pair, number in shared.most_common():
+            if number >= MIN_COMMON_VIEWS and best[pair[0]] < EACH_VIEW:
+                pairs.add(pair)
+                best[pair[0]] += 1
+        if other - one <= BESIDE and len(groups[one]) == len(groups[other]):
+            pairs |= set(zip(groups[one], groups[other], strict=True))
+    return sorted((min(pair), max(pair)) for pair in pairs)
 
 
 def pairs_with(some: list[int], count: int) -> Pairs:
@@ -67,17 +101,23 @@ def coarse(descriptors: Array, scales: Array, most: int = COARSE) -> Array:
 
 def common(first: Array, second: Array) -> int:
     """Number of mutual best matches between two sets of unit descriptors that also pass the ratio test."""
+    return len(matches_of(first, second))
+
+
+def matches_of(first: Array, second: Array) -> Array:
+    """(K, 2) indices of these matches."""
     if len(first) < 2 or len(second) < 2:
-        return 0
+        return np.zeros((0, 2), np.int64)
     similarity = first @ second.T
     forward = similarity.argmax(axis=1)
     mutual = similarity.argmax(axis=0)[forward] == np.arange(len(first))
     rows = similarity[mutual]
     if len(rows) == 0:
-        return 0
+        return np.zeros((0, 2), np.int64)
     top = np.partition(rows, -2, axis=1)[:, -2:]
     angle = np.arccos(np.clip(top, -1.0, 1.0))
-    return int(np.count_nonzero(angle[:, 1] < RATIO * angle[:, 0]))
+    sure = np.flatnonzero(mutual)[angle[:, 1] < RATIO * angle[:, 0]]
+    return np.stack([sure, forward[sure]], axis=1)
 
 
 def loop_pairs(sketches: list[Array], stride: int) -> Pairs:

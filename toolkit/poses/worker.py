@@ -95,7 +95,7 @@ def place(job: Job, report: Report) -> Placed:
     """
     model, facts = _mapped(job, report)
     missing = _missing(job, model)
-    if not job.sequential and missing and MAX_EXHAUSTIVE < len(job.images) <= MAX_ASKED_AGAIN:
+    if not job.sequential and not job.rigged and missing and MAX_EXHAUSTIVE < len(job.images) <= MAX_ASKED_AGAIN:
 
         def again(done: float, total: float, note: str) -> None:
             report(total, total, f"{note} ({len(missing)} pictures without a place, again)")
@@ -162,7 +162,7 @@ def _better(after: Placed, before: Placed) -> bool:
 
 
 def _few(job: Job) -> bool:
-    return not job.sequential and len(job.images) <= FEW
+    return not job.sequential and not job.rigged and len(job.images) <= FEW
 
 
 def _records(job: Job) -> list[dict[str, Any]]:
@@ -187,11 +187,13 @@ def _mapped(job: Job, report: Report) -> Placed:
         facts: dict[str, Any] = {"pairs": store.pair_facts(database), "attempts": [], "folded": None}
     if not facts["pairs"]:
         return None, facts
-    mapped = loops.never_folded(job, report) if job.sequential else None
+    mapped = loops.never_folded(job, report) if job.sequential and not job.rigged else None
     if mapped is None:
         model, facts["attempts"] = mapping.map_images(job, report)
         if model is None:
             return None, facts
+        if job.rigged:  # what shows everything around is seldom taken for another place, and steps are counted in images there
+            return model, facts
         mapped = loops.without_folds(job, model, facts["attempts"], report)
     model, facts["attempts"], facts["folded"] = mapped
     return model, facts

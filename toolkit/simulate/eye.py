@@ -12,7 +12,7 @@ from typing import Protocol
 import numpy as np
 import torch
 
-from fieldfuse.camera import Array, Intrinsics, pixel_grid
+from fieldfuse.camera import EQUIRECTANGULAR, FISHEYE, Array, Intrinsics, directions_of, pixel_grid
 from fieldfuse.effects.models import Distortion, encode_srgb
 from fieldfuse.effects.scenery import Background, Highlights
 from fieldfuse.simulate.solids import FAR, Mesh
@@ -78,7 +78,7 @@ class Eye:
     side: int  # rays across a pixel, each way, where it holds an edge
     rows: Tensor  # (H · W,) int64 row of each pixel
     directions: Tensor  # (H · W, 3) unit, through pixel centres
-    cosine: Tensor  # (H · W,) depth along z = distance · cosine
+    cosine: Tensor  # (H · W,) depth along z = distance · cosine; 1 for fisheye lenses and panoramas
     finer: Tensor | None  # (H · W, side², 3) unit, through the places of a pixel; None when side is 1
 
 
@@ -87,7 +87,7 @@ class Picture:
     """One exposure at one instant: linear light and geometry, aligned, on the scene's device."""
 
     linear: Tensor  # (H, W, 3) float32, not clipped
-    depth: Tensor  # (H, W) float32 metres along z at pixel centres, 0 where nothing is hit
+    depth: Tensor  # (H, W) float32 metres along z (fisheye, panorama: along the ray) at pixel centres, 0 where nothing is hit
     normals: Tensor  # (H, W, 3) unit, world axes; 0 where nothing is hit
     albedo: Tensor  # (H, W, 3) linear reflectance; 0 where nothing is hit
     gloss: Tensor  # (H, W)
@@ -114,6 +114,9 @@ def eye_of(intrinsics: Intrinsics, side: int, device: torch.device) -> Eye:
 
 def _directions(intrinsics: Intrinsics, pixels: Array) -> tuple[Tensor, Tensor]:
     """Unit directions (N, 3) in camera axes through (N, 2) pixels, and their cosines with the optical axis (N,)."""
+    if intrinsics.lens in (FISHEYE, EQUIRECTANGULAR):
+        rays = torch.from_numpy(directions_of(intrinsics, pixels))
+        return rays.float(), torch.ones(len(rays))  # what lies beside and behind has no depth along the axis: it is the distance
     place = torch.from_numpy((pixels - [intrinsics.cx, intrinsics.cy]) / [intrinsics.fx, intrinsics.fy])
     ideal = Distortion.of(intrinsics).invert(place) if intrinsics.distorted else place
     cosine = (1 + ideal.square().sum(1)).rsqrt()

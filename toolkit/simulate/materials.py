@@ -113,6 +113,16 @@ class TextureBank(Atlas):
         super().__init__([np.clip(image, 0, 1).astype(np.float32) ** GAMMA for image in pictures])
         self.kinds = kinds
 
+    def with_pictures(self, pictures: list[Array]) -> TextureBank:
+        """The bank with (h, w, 3) sRGB pictures more, of any size; they are numbered on from `count`."""
+        more = Atlas([np.clip(image, 0, 1).astype(np.float32) ** GAMMA for image in pictures])
+        joined = copy(self)
+        joined.texels, joined.count = torch.cat([self.texels, more.texels.to(self.texels.device)]), self.count + more.count
+        shifted = more.table + torch.tensor([len(self.texels), 0, 0])
+        rows = [part for level in zip(self.table.cpu().split(self.count), shifted.split(more.count), strict=True) for part in level]
+        joined.table = torch.cat(rows).to(self.table.device)
+        return joined
+
     def to(self, device: torch.device | str) -> TextureBank:
         if self.texels.device == torch.device(device):
             return self

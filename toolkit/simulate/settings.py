@@ -10,24 +10,36 @@ from typing import Annotated, Any
 import numpy as np
 from pydantic import Field
 
+from fieldfuse import camera as lenses
 from fieldfuse.camera import Intrinsics
 from fieldfuse.config import checked, one_of, read_yaml
 from fieldfuse.errors import InputError
 from fieldfuse.simulate.paths import PathSettings
+from fieldfuse.simulate.survey import GpsSettings, MarkerSettings
 
+WIDEST_PINHOLE = 140
 MAX_BYTES = 2**20
 OUTPUTS = ("frames", "photos", "video")
 Point = Annotated[list[float], Field(min_length=3, max_length=3)]
 
 
+PINHOLE, FISHEYE, PANORAMA = "pinhole", "fisheye", "panorama"
+
+
 @dataclass
 class CameraSettings:
+    kind: Annotated[str, one_of(PINHOLE, FISHEYE, PANORAMA)] = PINHOLE  # fisheye: equidistant; panorama: 360°, equirectangular
     width: Annotated[int, Field(ge=16, le=4096)] = 640  # pixels
     height: Annotated[int, Field(ge=16, le=4096)] = 480
-    fov: Annotated[float, Field(ge=5, le=140)] = 65.0  # degrees across the width, without lens distortion
+    fov: Annotated[float, Field(ge=5, le=220)] = 65.0  # degrees across the width, without lens distortion; a pinhole's are 140 at most
 
     def intrinsics(self) -> Intrinsics:
-        """The pinhole camera, its principal point in the middle."""
+        """The camera, its principal point in the middle."""
+        if self.kind == PANORAMA:
+            return Intrinsics.equirectangular(self.width, self.height)
+        if self.kind == FISHEYE:
+            focal = self.width / float(np.deg2rad(self.fov))
+            return Intrinsics(self.width, self.height, focal, focal, 0.5 * self.width, 0.5 * self.height, lenses.FISHEYE)
         focal = 0.5 * self.width / float(np.tan(0.5 * np.deg2rad(self.fov)))
         return Intrinsics(self.width, self.height, focal, focal, 0.5 * self.width, 0.5 * self.height)
 
@@ -53,6 +65,8 @@ class SceneFile:
     depth: bool = False  # a depth camera beside the colour camera
     side: Annotated[int, Field(ge=1, le=8)] = 2  # pixels that hold an edge are the mean of side × side rays
     mesh: MeshSettings = default(default_factory=MeshSettings)
+    markers: Annotated[list[MarkerSettings], Field(max_length=100)] = default(default_factory=list)  # ArUco markers, in procedural scenes
+    gps: GpsSettings | None = None  # in the images' EXIF; None: they have none
     effects: Any = None
 
 
@@ -80,8 +94,17 @@ def scene_file(data: dict[str, Any], where: str) -> SceneFile:
     """
     settings = checked(SceneFile, {key: value for key, value in data.items() if key != "effects"}, where)
     settings.effects = data.get("effects")
+    kind = settings.camera.kind
+    if kind == PINHOLE and settings.camera.fov > WIDEST_PINHOLE:
+        raise InputError(f"{where}: a pinhole's fov is at most {WIDEST_PINHOLE} degrees; lower camera.fov, or set camera.kind: fisheye")
+    if kind == PANORAMA and settings.camera.width != 2 * settings.camera.height:
+        raise InputError(f"{where}: a panorama is twice as wide as high; correct camera.width and camera.height")
+    if kind != PINHOLE and settings.depth:
+        raise InputError(f"{where}: the depth camera is a pinhole; leave out `depth: true`, or camera.kind: {kind}")
     if settings.depth and settings.output != "frames":
         raise InputError(f"{where}: depth needs `output: frames`; {settings.output} have nowhere to put it")
+    if settings.gps is not None and settings.output == "video":
+        raise InputError(f"{where}: gps needs `output: frames` or `photos`; a video's frames have no place for it")
     if settings.output == "video" and (settings.camera.width % 2 or settings.camera.height % 2):
         raise InputError(f"{where}: videos need an even width and height; correct camera.width and camera.height")
     return settings

@@ -11,7 +11,7 @@ import cv2
 import numpy as np
 from safetensors.numpy import save
 
-from fieldfuse.camera import Array, Intrinsics, opengl_from_world
+from fieldfuse.camera import EQUIRECTANGULAR, FISHEYE, Array, Intrinsics, opengl_from_world
 from fieldfuse.effects.effect_specs import Effects, parse
 from fieldfuse.errors import InputError, OutputError
 from fieldfuse.files import atomic_path, write_json
@@ -21,13 +21,17 @@ from fieldfuse.simulate.film import Film, FilmCamera, Shot, drawing
 from fieldfuse.simulate.mesh_scene import SUFFIXES, load_mesh_scene
 from fieldfuse.simulate.paths import plan
 from fieldfuse.simulate.procedural import random_scene
-from fieldfuse.simulate.settings import SceneFile
+from fieldfuse.simulate.scene import Scene
+from fieldfuse.simulate.settings import PANORAMA, PINHOLE, SceneFile
 from fieldfuse.simulate.solids import Mesh
+from fieldfuse.simulate.survey import Receiver, with_markers
 
 SCENE, PATH = 0, 1  # streams of random numbers
 TRUTH = "ground_truth"
 DEPTH_STEPS = 1000.0  # stored depth values a metre
 MOST_STEPS = 65535
+LENS_EFFECTS = ("distortion", "vignetting")
+MODELS = ("PINHOLE", "OPENCV")
 
 
 def open_scene(settings: SceneFile, beside: Path) -> Scenery:
@@ -55,8 +59,17 @@ def prepare(settings: SceneFile, beside: Path, effects: Effects) -> Film:
     for name in ("depth_noise", "depth_offset"):
         if getattr(effects, name) is not None and not settings.depth:
             raise InputError(f"{name} is listed, but the capture has no depth; set `depth: true` in the scene file")
+    if settings.camera.kind != PINHOLE and (wrong := [name for name in LENS_EFFECTS if getattr(effects, name) is not None]):
+        kind = f"camera.kind: {settings.camera.kind}"
+        raise InputError(f"{wrong[0]} is listed, which is modelled for a pinhole camera only; leave it out with {kind}")
     scene = open_scene(settings, beside)
+    if settings.markers:
+        if not isinstance(scene, Scene):
+            raise InputError("markers can be put into procedural scenes only; put them into the mesh itself, or leave `markers` out")
+        scene = with_markers(scene, settings.markers)
     motion = plan(scene, settings.path, np.random.default_rng([settings.seed, PATH]))
+    if settings.camera.kind == PANORAMA:  # such cameras stand upright, or their software turns what they filmed so
+        motion = replace(motion, curve=replace(motion.curve, forward=motion.curve.forward * [1.0, 1.0, 0.0]))
     if effects.background is not None:
         effects = replace(effects, background=replace(effects.background, seed=effects.background.seed + settings.seed))
     camera = FilmCamera(settings.camera.intrinsics(), settings.side, settings.depth)
@@ -97,6 +110,7 @@ def simulate(
         closing(CaptureWriter(temporary, film.intrinsics, settings.path.fps, settings.output, suffix)) as writer,
         drawing(film.shot, range(len(film)), workers) as shots,
     ):
+        writer.receiver = None if settings.gps is None else Receiver(settings.gps, settings.seed)
         for done, shot in enumerate(shots):
             progress.check()
             writer.add(shot)
@@ -117,6 +131,7 @@ class CaptureWriter:
     def __init__(self, folder: Path, intrinsics: Intrinsics, fps: float, output: str, suffix: str) -> None:
         self.folder, self.intrinsics, self.output, self.suffix = folder, intrinsics, output, suffix
         self.entries, self.poses, self.facts = (list[dict[str, Any]]() for _ in range(3))
+        self.receiver: Receiver | None = None  # where images get their GPS from
         self._video: cv2.VideoWriter | None = None
         for name in (f"{TRUTH}/frames", *(() if output == "video" else ("images",))):
             (folder / name).mkdir(parents=True, exist_ok=True)
@@ -133,15 +148,16 @@ class CaptureWriter:
         entry: dict[str, Any] = {"file_path": f"images/{name}{self.suffix}"}
         if self._video is not None:
             self._video.write(cv2.cvtColor(shot.rgb, cv2.COLOR_RGB2BGR))
-        elif shot.jpeg is not None:
-            (self.folder / entry["file_path"]).write_bytes(shot.jpeg)
         else:
-            self._png(entry["file_path"], cv2.cvtColor(shot.rgb, cv2.COLOR_RGB2BGR))
+            data = shot.jpeg if shot.jpeg is not None else encoded(cv2.cvtColor(shot.rgb, cv2.COLOR_RGB2BGR))
+            tagged = data if self.receiver is None else self.receiver.tagged(data, shot.world_from_camera[:3, 3], shot.index)
+            (self.folder / entry["file_path"]).write_bytes(tagged)
         if shot.sensor_depth is not None:
             entry["depth_file_path"] = f"depth/{name}.png"
             (self.folder / "depth").mkdir(exist_ok=True)
             steps = np.round(shot.sensor_depth.astype(np.float64) * DEPTH_STEPS)  # 0 where there is none or it is too far (65.5 m)
-            self._png(entry["depth_file_path"], np.where((steps > 0) & (steps < MOST_STEPS), steps, 0).astype(np.uint16))
+            stored = np.where((steps > 0) & (steps < MOST_STEPS), steps, 0).astype(np.uint16)
+            (self.folder / entry["depth_file_path"]).write_bytes(encoded(stored))
         entry["transform_matrix"] = opengl_from_world(shot.world_from_camera).tolist()
         self.entries.append(entry)
         exact = {"depth": np.ascontiguousarray(shot.depth), "normals": shot.normals.astype(np.float16)}
@@ -160,7 +176,7 @@ class CaptureWriter:
             size = {"w": lens.width, "h": lens.height, "fl_x": lens.fx, "fl_y": lens.fy, "cx": lens.cx, "cy": lens.cy}
             bent = dict(zip(("k1", "k2", "p1", "p2", "k3"), lens.distortion, strict=False))
             scale = {"integer_depth_scale": 1 / DEPTH_STEPS} if any("depth_file_path" in entry for entry in self.entries) else {}
-            model = {"camera_model": "OPENCV" if lens.distorted else "PINHOLE"}
+            model = {"camera_model": {FISHEYE: "OPENCV_FISHEYE", EQUIRECTANGULAR: "EQUIRECTANGULAR"}.get(lens.lens, MODELS[lens.distorted])}
             write_json(self.folder / "transforms.json", {**model, **size, **bent, **scale, "frames": self.entries})
         write_json(truth / "cameras.json", {"intrinsics": lens.to_dict(), "frames": self.poses})
         write_json(truth / "effects.json", {"effects": effects, "frames": self.facts})
@@ -172,9 +188,11 @@ class CaptureWriter:
         if self._video is not None:
             self._video.release()
 
-    def _png(self, name: str, picture: Array) -> None:
-        _, data = cv2.imencode(".png", picture, [cv2.IMWRITE_PNG_COMPRESSION, 3])
-        (self.folder / name).write_bytes(data.tobytes())
+
+def encoded(picture: Array) -> bytes:
+    """As PNG."""
+    _, data = cv2.imencode(".png", picture, [cv2.IMWRITE_PNG_COMPRESSION, 3])
+    return data.tobytes()
 
 
 def write_mesh(path: Path, mesh: Mesh) -> None:

@@ -6,20 +6,24 @@ import json
 import shutil
 from collections.abc import Callable
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 
 import cv2
 import numpy as np
 import torch
+from PIL import Image
 
-from fieldfuse.camera import Intrinsics, Similarity
+from fieldfuse.camera import Intrinsics, Similarity, opengl_from_world
 from fieldfuse.capture import open_capture
 from fieldfuse.capture.checks import check_capture
 from fieldfuse.capture.images import load_image, load_mask
 from fieldfuse.capture.ply_points import read_ply_points
 from fieldfuse.capture.prepare import prepare_views
+from fieldfuse.capture.sphere import cut_view, to_cut, views_of
 from fieldfuse.capture.storage import capture_from_dict, capture_to_dict, load_views, save_views
 from fieldfuse.capture.types import Capture, Views
+from fieldfuse.capture.unpack import unpacked
 from fieldfuse.capture.video import iterate_video, read_video
 from fieldfuse.config import CaptureSettings, load_settings
 from fieldfuse.files import read_json, write_json
@@ -30,6 +34,7 @@ from fieldfuse.tone import Tone
 from tests.capture.dng import mosaic, write_dng
 from tests.capture.layouts import LAYOUTS, write_record3d, zipped
 from tests.capture.made import eyes, render, save_picture
+from tests.capture.spheres import room, walk
 from tests.stability.fuzz.given import (
     DATASETS,
     MESHES,
@@ -119,6 +124,19 @@ def make_recording(root: Path) -> None:
     shutil.rmtree(source)
 
 
+def make_zip(root: Path) -> None:
+    source = root.with_name(f"{root.name}-unpacked")
+    LAYOUTS["transforms"][1](source)
+    root.mkdir(parents=True, exist_ok=True)
+    zipped(source, root / "a.zip", "scan/")
+    shutil.rmtree(source)
+
+
+def read_zip(root: Path, number: int) -> None:
+    with unpacked(root / "a.zip") as place:
+        read_capture(place, number)
+
+
 def make_extras(root: Path) -> None:
     """`transforms.json` with everything optional: masks, float depth, a point cloud, splits."""
     LAYOUTS["transforms"][1](root)
@@ -133,6 +151,31 @@ def make_extras(root: Path) -> None:
     (root / "points.ply").write_text(header + "0 0 0\n1 0.5 2\n-1 3 1e-3\n")
     data.update(ply_file_path="points.ply", depth_unit_scale_factor=1.0, train_filenames=["images/0001.png"], applied_scale=1.0)
     (root / "transforms.json").write_text(json.dumps(data))
+
+
+def make_panoramas(root: Path) -> None:
+    """Posed panoramas, photos of panoramas with Google's XMP in a folder beside, and fisheye images."""
+    xmp = b'<x:xmpmeta xmlns:x="adobe:ns:meta/"><GPano:ProjectionType>equirectangular</GPano:ProjectionType></x:xmpmeta>'
+    for name, model in (("posed", "EQUIRECTANGULAR"), ("photos", ""), ("fisheye", "OPENCV_FISHEYE")):
+        (root / name).mkdir(parents=True)
+        frames = []
+        for number, pose in enumerate(walk(4)):
+            frames.append({"file_path": f"{number}.jpg", "transform_matrix": opengl_from_world(pose).tolist()})
+            Image.fromarray(room(Intrinsics.equirectangular(64, 32), pose)[0]).save(root / name / f"{number}.jpg", xmp=xmp)
+        lens = {"fl_x": 20.0, "fl_y": 20.0, "k1": 0.01, "k2": -0.002} if model == "OPENCV_FISHEYE" else {}
+        if model:
+            (root / name / "transforms.json").write_text(json.dumps({"camera_model": model, **lens, "frames": frames}))
+
+
+def read_panoramas(root: Path, number: int) -> None:
+    def read(folder: Path) -> None:
+        capture = check_capture(contained(open_capture(folder), folder))
+        for index in to_cut(capture):
+            frame = capture.frames[index]
+            for view in views_of(frame.intrinsics)[0]:
+                cut_view(load_image(frame), frame.intrinsics, view)
+
+    all_of(*(partial(read, root / name) for name in ("posed", "photos", "fisheye")))
 
 
 LAYOUTS_CAMERA = LAYOUTS["transforms"][1].__globals__["OFF_CENTRE"]
@@ -239,13 +282,15 @@ def make_runs(root: Path) -> None:
     save_pictures(root / "field.pictures.safetensors", Pictures(["a"], [Picture(pixels, depth)], [0.1], {"x": 1}))
     small_field(1, 0.2).save(root / "field.safetensors")
     small_field(1, 0.2, decoder="per_sample", shell=1.0).save(root / "other.safetensors")
+    frame = {"camera_to_world": np.eye(4).reshape(-1).tolist(), "fov": 50.0}
+    write_json(root / "camera_path.json", {"render_width": 16, "render_height": 12, "fps": 24, "camera_path": [frame] * 2})
     (root / "settings.yaml").write_text("preset: fast\nfit: {budget: 5.0}\nexport:\n  formats: [ply, obj]\ntsdf: {enabled: off}\n")
 
 
 def read_json_files(root: Path, number: int) -> None:
     """Every JSON file of a run's folder, as the commands read it."""
     from fieldfuse.pipelines.folder import RunFolder
-    from fieldfuse.pipelines.render_path import read_cameras
+    from fieldfuse.pipelines.render_path import path_fps, read_cameras
     from fieldfuse.pipelines.stages import finished_stages
     from fieldfuse.poses.result import PoseResult
     from fieldfuse.poses.scene import Scene
@@ -258,6 +303,8 @@ def read_json_files(root: Path, number: int) -> None:
         lambda: PoseResult.from_dict(read_json(root / "poses.json")),
         lambda: Scene.from_dict(read_json(root / "scene.json")),
         lambda: read_cameras(root / "source" / "transforms.json"),
+        lambda: read_cameras(root / "camera_path.json"),
+        lambda: path_fps(root / "camera_path.json"),
         lambda: load_settings("balanced", file=root / "settings.yaml"),
     )
 
@@ -280,18 +327,24 @@ def read_tensors(root: Path, number: int) -> None:
     all_of(lambda: load_views(root / "views.safetensors"), lambda: load_pictures(root / "field.pictures.safetensors"))
 
 
-RUN_FILES = ("run.json", "capture.json", "poses.json", "scene.json", "stages/views.json", "settings.yaml", "source/transforms.json")
+RUN_FILES = (
+    "run.json", "capture.json", "poses.json", "scene.json", "stages/views.json", "settings.yaml", "source/transforms.json",
+    "camera_path.json",
+)  # fmt: skip
 TRAINING_FILES = (
     "shard.safetensors", "checkpoint-0000007.safetensors", "train.yaml", "depths.safetensors", "left_out.safetensors",
     "fieldfuse/speed.json",
 )  # fmt: skip
+PANORAMAS = ("posed/transforms.json", "posed/1.jpg", "photos/1.jpg", "fisheye/transforms.json", "fisheye/transforms.json")
 TARGETS: tuple[Target, ...] = (
     *(Target(layout, files, LAYOUTS[layout][1], read_capture, 1.0) for layout, files in FILES.items()),
     Target("recording", ("a.r3d",), make_recording, read_capture, 1.0),
+    Target("zip file", ("a.zip",), make_zip, read_zip, 1.0),
     Target("extras", ("transforms.json", "mask1.png", "depth2.npy", "points.ply"), make_extras, read_capture, 2.0),
     Target("photos", PHOTOS, make_photos, read_photo_folder, 3.0),
     Target("openexr", ("a.exr", "b.exr", "c.exr"), make_exr, read_photo_folder, 1.0),
     Target("camera raw", ("a.dng", "b.dng", "c.dng"), make_raw, read_photo_folder, 1.0),
+    Target("panoramas", PANORAMAS, make_panoramas, read_panoramas, 1.0),
     Target("videos", ("a.avi", "b.mp4", "c.webm"), make_videos, read_one_video, 1.5),
     Target("run json", RUN_FILES, make_runs, read_json_files, 2.0),
     Target("results", RESULT_FILES, make_results, read_results, 2.5),

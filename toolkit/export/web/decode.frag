@@ -8,6 +8,7 @@ uniform vec2 size, range;  // of inverse depth, from far to near
 uniform vec3 sky[9];       // of one colour: the others are 0
 uniform int show;          // 0 colours, 1 depth, 2 opacity
 uniform float exposure;
+uniform bool cropped;      // then nothing is behind it
 
 const int INPUTS = 8, WIDE = HIDDEN / 4, THIRD = WIDE / 3;
 layout(std140) uniform Small { mat4 w1[WIDE * INPUTS]; vec4 b1[WIDE], b2[WIDE], w3[3 * WIDE], b3; };
@@ -76,7 +77,7 @@ void main() {
   harmonics(d, h);
   vec3 behind = vec3(0);
   for (int i = 0; i < 9; i++) behind += sky[i] * h[i];
-  behind = clamp(behind, 0.0, 1.0);
+  behind = cropped ? vec3(0.1) : clamp(behind, 0.0, 1.0);
   if (opacity == 0.0) {
     shown = vec4(exposed(behind), 1);
     return;

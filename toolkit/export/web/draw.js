@@ -2,8 +2,8 @@
 
 const FULL = `#version 300 es
 void main() { gl_Position = vec4(vec2(gl_VertexID & 1, gl_VertexID >> 1) * 4.0 - 1.0, 0, 1); }`;
-const COPY = `uniform sampler2D picture; uniform vec2 size; out vec4 shown;
-void main() { shown = vec4(texture(picture, gl_FragCoord.xy / size).rgb, 1); }`;
+const COPY = `uniform sampler2D picture; uniform vec2 size, corner; out vec4 shown;
+void main() { shown = vec4(texture(picture, (gl_FragCoord.xy - corner) / size).rgb, 1); }`;
 const WIDTH_BITS = 12;
 const MOST_TARGETS = 8;
 
@@ -143,7 +143,7 @@ class Field {
     });
   }
 
-  // Lines `from` … `to` (from below) of the picture that `view` shows: {turn: 9 numbers, column by column, place, lens, show, range}.
+  // Lines `from` … `to` (from below) of the picture that `view` shows: {turn: 9 numbers, column by column, place, lens, show, range, crop}.
   strip(target, view, from, to) {
     const gl = this.gl, {width, height} = target;
     gl.viewport(0, 0, width, height);
@@ -153,6 +153,10 @@ class Field {
     gl.useProgram(this.march.program);
     this.bind(this.march, this.textures);
     gl.uniform3fv(this.march.at('place'), view.place);
+    if (view.crop) {
+      gl.uniformMatrix3fv(this.march.at('cropTurn'), false, view.crop.turn);
+      gl.uniform3fv(this.march.at('cropShift'), view.crop.shift);
+    }
     this.look(this.march, view, width, height);
     gl.drawArrays(gl.TRIANGLES, 0, 3);
     this.colour(target, view);
@@ -164,6 +168,7 @@ class Field {
     gl.uniformMatrix3fv(of.at('turn'), false, view.turn);
     gl.uniform4fv(of.at('lens'), view.lens);
     gl.uniform2f(of.at('size'), width, height);
+    gl.uniform1i(of.at('cropped'), view.crop ? 1 : 0);
   }
 
   colour(target, view) {
@@ -177,14 +182,15 @@ class Field {
     gl.drawArrays(gl.TRIANGLES, 0, 3);
   }
 
-  // The picture of a target, made as large as another one, or as the page (null).
+  // The picture of a target, made as large as another one, or as the page (null), or a part {decoded, x, y, width, height} of what a headset shows.
   put(target, onto) {
-    const gl = this.gl, {width, height} = onto || {width: gl.drawingBufferWidth, height: gl.drawingBufferHeight};
+    const gl = this.gl, {x = 0, y = 0, width, height} = onto || {width: gl.drawingBufferWidth, height: gl.drawingBufferHeight};
     gl.bindFramebuffer(gl.FRAMEBUFFER, onto ? onto.decoded : null);
-    gl.viewport(0, 0, width, height);
+    gl.viewport(x, y, width, height);
     gl.useProgram(this.copy.program);
     this.bind(this.copy, {picture: target.picture});
     gl.uniform2f(this.copy.at('size'), width, height);
+    gl.uniform2f(this.copy.at('corner'), x, y);
     gl.drawArrays(gl.TRIANGLES, 0, 3);
   }
 

@@ -14,6 +14,9 @@ uniform float halfSize, shell, extent, voxel, near;
 uniform vec4 lens, low[4], scale[4];  // fx, fy, cx, cy
 uniform mat3 turn;                    // world from camera
 uniform vec2 size;
+uniform bool cropped;    // only what lies in a box is shown:
+uniform mat3 cropTurn;   // to coordinates that are between -1 and 1 in it
+uniform vec3 cropShift;
 
 layout(location = 0) out uvec4 first;
 layout(location = 1) out uvec4 second;
@@ -56,6 +59,13 @@ void colour(inout vec4 mean[4], int slot, ivec3 cell, vec3 f, float weight) {
   }
 }
 
+// Where a ray enters a box of half size `box` about zero, and where it leaves it.
+vec2 through(vec3 o, vec3 d, vec3 box) {
+  vec3 way = mix(d, vec3(1e-9), lessThan(abs(d), vec3(1e-9)));
+  vec3 a = (-box - o) / way, b = (box - o) / way, enter = min(a, b), leave = max(a, b);
+  return vec2(max(enter.x, max(enter.y, enter.z)), min(leave.x, min(leave.y, leave.z)));
+}
+
 void main() {
   vec2 pixel = (vec2(gl_FragCoord.x, size.y - gl_FragCoord.y) - lens.zw) / lens.xy;
   float cosine = inversesqrt(dot(pixel, pixel) + 1.0);
@@ -63,14 +73,17 @@ void main() {
   vec3 o = (place - centre) / halfSize;
   float coarse = voxel * 4.0, s = near / halfSize, start = s, leave = 3e38, rise = 0.0;
   if (shell == 0.0) {
-    vec3 way = mix(d, vec3(1e-9), lessThan(abs(d), vec3(1e-9)));
-    vec3 a = (-box - o) / way, b = (box - o) / way;
-    vec3 enter = min(a, b), exit = max(a, b);
-    s = max(s, max(enter.x, max(enter.y, enter.z)));
-    leave = min(exit.x, min(exit.y, exit.z));
+    vec2 inside = through(o, d, box);
+    s = max(s, inside.x);
+    leave = inside.y;
   } else {
     vec3 p = o - dot(o, d) * d;
     rise = inversesqrt(shell * shell + extent * extent * dot(p, p));
+  }
+  if (cropped) {
+    vec2 inside = through(cropTurn * o + cropShift, cropTurn * d, vec3(1));
+    s = max(s, inside.x);
+    leave = min(leave, inside.y);
   }
   float far = shell / voxel, light = 1.0, median = 0.0, total = 0.0;
   float most = float(RESOLUTION) - 1e-3;
@@ -82,14 +95,14 @@ void main() {
   for (int turnOf = 0; turnOf < LONGEST; turnOf++) {
     vec3 y = o + s * d;
     float n = 1.0, s1;
-    if (shell == 0.0) {
-      if (s >= leave) break;
-      s1 = min(s + coarse, leave);
-    } else {
+    if (s >= leave) break;
+    if (shell == 0.0) s1 = s + coarse;
+    else {
       n = norm(y);
       if (n > far) break;
       s1 = s + coarse * clamp(n * n * rise, 1.0, STRETCH);
     }
+    s1 = min(s1, leave);
     if (!known) p0 = contracted(y, n);
     y = o + s1 * d;
     vec3 p1 = contracted(y, shell == 0.0 ? 1.0 : norm(y));

@@ -1,5 +1,6 @@
 // From the page's own bytes to arrays for the graphics card. Only what cannot be worked out is in the page: which voxels there are, a byte
-// of density and sixteen of features a corner. Places of voxels and corners follow by counting, as `render/bake.py` counted them.
+// of density and sixteen of features a corner, as differences (`export/corners.py`). Places of voxels and corners follow by counting, as
+// `render/bake.py` counted them.
 
 const ONES = Uint8Array.from({length: 512}, (_, n) => { let count = 0; for (; n; n &= n - 1) count++; return count; });
 
@@ -84,10 +85,76 @@ function densitiesOf(bits, rows, density, voxels) {
   return eight;
 }
 
+// The same corner in a block before this one, -1: there is none.
+function before(slot, x, y, z, keys, rows, table, size) {
+  const i = keys[3 * slot], j = keys[3 * slot + 1], k = keys[3 * slot + 2];
+  const beside = v => v === 0 ? -1 : v === 8 ? 1 : 0, sx = beside(x), sy = beside(y), sz = beside(z);
+  for (let way = 1; way < 8; way++) {
+    const dx = way & 1 ? sx : 0, dy = way & 2 ? sy : 0, dz = way & 4 ? sz : 0;
+    if (i + dx < 0 || j + dy < 0 || k + dz < 0 || i + dx >= size[0] || j + dy >= size[1] || k + dz >= size[2]) continue;
+    const other = table[((k + dz) * size[1] + j + dy) * size[0] + i + dx];
+    if (other < 0 || other >= slot) continue;
+    const row = 2 * (other * 81 + (z - 8 * dz) * 9 + y - 8 * dy), below = x - 8 * dx;
+    if (rows[row] >> below & 1) return rows[row + 1] + ONES[rows[row] & (1 << below) - 1];
+  }
+  return -1;
+}
+
+// What is predicted from the neighbours `at` (x, y, z, xy, xz, yz, xyz before it; -1: not there) in `values`, `each` bytes a corner.
+function guess(values, each, offset, at, how, sides) {
+  if (how === 3) {
+    const near = values[each * at[0] + offset] + values[each * at[1] + offset] + values[each * at[2] + offset];
+    const across = values[each * at[3] + offset] + values[each * at[4] + offset] + values[each * at[5] + offset];
+    const sum = 10 * near - 5 * across + values[each * at[6] + offset] + 8 >> 4;
+    return sum < 0 ? 0 : sum > 255 ? 255 : sum;
+  }
+  if (how < 3) {  // a plane: xy, xz or yz
+    const one = at[how === 2 ? 1 : 0], two = at[how === 0 ? 1 : 2];
+    const sum = 3 * (values[each * one + offset] + values[each * two + offset]) - 2 * values[each * at[3 + how] + offset] + 2 >> 2;
+    return sum < 0 ? 0 : sum > 255 ? 255 : sum;
+  }
+  let sum = 0;
+  for (let i = 0; i < 3; i++) if (at[i] >= 0) sum += values[each * at[i] + offset];
+  return sides ? (2 * sum + sides) / (2 * sides) | 0 : 0;
+}
+
+// Features (16 bytes) and density of every corner: those of a block before, or what the neighbours predict and the difference from it.
+function valuesOf({keys, values}, rows, corners, channels, table, size) {
+  const feature = new Uint8Array(16 * corners), density = new Uint8Array(corners), written = values.length / (channels + 1);
+  const place = new Int32Array(1000), near = new Int32Array(7);  // of the block's corners with a margin, and of those before one
+  let to = 0, next = 0;
+  for (let slot = 0; 162 * slot < rows.length; slot++) {
+    place.fill(-1);
+    for (let line = 0; line < 81; line++) {
+      const row = rows[2 * (slot * 81 + line)], z = line / 9 | 0, y = line % 9, edge = y === 0 || y === 8 || z === 0 || z === 8;
+      for (let x = 0; row >> x; x++) {
+        if (!(row >> x & 1)) continue;
+        const p = (z + 1) * 100 + (y + 1) * 10 + x + 1;
+        const old = edge || x === 0 || x === 8 ? before(slot, x, y, z, keys, rows, table, size) : -1;
+        place[p] = to;
+        if (old >= 0) {
+          for (let c = 0; c < channels; c++) feature[16 * to + c] = feature[16 * old + c];
+          density[to++] = density[old];
+          continue;
+        }
+        const a = near[0] = place[p - 1], b = near[1] = place[p - 10], c = near[2] = place[p - 100];
+        const ab = near[3] = place[p - 11], ac = near[4] = place[p - 101], bc = near[5] = place[p - 110], abc = near[6] = place[p - 111];
+        const sides = (a >= 0) + (b >= 0) + (c >= 0);
+        const how = (a | b | c | ab | ac | bc | abc) >= 0 ? 3 : (a | b | ab) >= 0 ? 0 : (a | c | ac) >= 0 ? 1 : (b | c | bc) >= 0 ? 2 : 4;
+        for (let c = 0; c < channels; c++) feature[16 * to + c] = guess(feature, 16, c, near, how, sides) + values[c * written + next];
+        density[to] = guess(density, 1, 0, near, how, sides) + values[channels * written + next];
+        next++;
+        to++;
+      }
+    }
+  }
+  if (next !== written) throw new Error('the field in this page is damaged');
+  return {feature, density};
+}
+
 function unpacked(buffer, about) {
   const given = arraysOf(buffer, about.arrays);
-  const {slices, voxels} = slicesOf(given.bits), {rows, corners} = rowsOf(given.bits);
-  if (corners !== given.density.length) throw new Error('the field in this page is damaged');
-  const densities = densitiesOf(given.bits, rows, given.density, voxels);
-  return {...given, slices, rows, densities, voxels, table: blockTable(given.keys, about.table)};
+  const {slices, voxels} = slicesOf(given.bits), {rows, corners} = rowsOf(given.bits), table = blockTable(given.keys, about.table);
+  const {feature, density} = valuesOf(given, rows, corners, about.channels, table, about.table);
+  return {...given, slices, rows, densities: densitiesOf(given.bits, rows, density, voxels), feature, voxels, table};
 }

@@ -66,7 +66,7 @@ class Walker {
   // Whether it moved.
   travel(now) {
     if (!this.journey) return false;
-    const {from, to, since, milliseconds, reach} = this.journey, t = Math.min(1, (now - since) / milliseconds);
+    const {from, to, since, milliseconds, reach} = this.journey, t = Math.max(0, Math.min(1, (now - since) / Math.max(1, milliseconds)));
     this.pose = t === 1 ? to : between(from, to, t * t * (3 - 2 * t));
     if (t === 1) {
       this.reach = reach;
