@@ -46,9 +46,3 @@ def test_they_stay_as_they_are_until_the_field_changes(run: Path) -> None:
     data = read_json(run / "report.json")
     assert "splats" not in data["evaluation"]  # those of the earlier field are not scored as this one's
     assert not (run / "exports" / "splat.ply").exists() and any("splat.ply" in warning for warning in data["warnings"])
-
-
-def test_a_field_that_is_decoded_per_sample_has_none(tmp_path: Path) -> None:
-    finished(tmp_path / "out", 9, *FAST, "--decoder", "per_sample")
-    answer = said("export", tmp_path / "out", "--formats", "splat", *QUICK)
-    assert answer.code == 2 and "deferred decoder" in answer.err and not (tmp_path / "out" / "exports" / "splat.ply").exists()

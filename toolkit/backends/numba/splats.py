@@ -264,19 +264,19 @@ def draw_pass(flat: Any, entries: Any, starts: Any, across: Any, first: Any, las
                     base = np.uintp(y * TILE + group * LANES)
                     dx0 = F(left + group * LANES) + HALF - flat[i, X]
                     for lane in range(LANES):
-                        k = base + np.uintp(lane)
+                        pixel = base + np.uintp(lane)
                         dx = dx0 + F(np.int32(lane))
-                        light = acc[k]
+                        light = acc[pixel]
                         alpha = min(peak * _exp(-min(max(HALF * a * dx * dx + across_row * dx + square, ZERO), FARTHEST)), OPAQUEST)
                         alpha = alpha if alpha >= FAINT and light >= STOP else ZERO
                         weight = light * alpha
                         after = light - weight
-                        acc[k] = after
-                        acc[k + np.uintp(PIXELS)] += weight * red
-                        acc[k + np.uintp(2 * PIXELS)] += weight * green
-                        acc[k + np.uintp(3 * PIXELS)] += weight * blue
+                        acc[pixel] = after
+                        acc[pixel + np.uintp(PIXELS)] += weight * red
+                        acc[pixel + np.uintp(2 * PIXELS)] += weight * green
+                        acc[pixel + np.uintp(3 * PIXELS)] += weight * blue
                         if light > HALF and after <= HALF:
-                            acc[k + np.uintp(4 * PIXELS)] = depth
+                            acc[pixel + np.uintp(4 * PIXELS)] = depth
         for y in range(min(TILE, height - top)):
             for x in range(min(TILE, width - left)):
                 k = y * TILE + x
@@ -326,17 +326,17 @@ def pull_pass(flat: Any, entries: Any, starts: Any, across: Any, first: Any, las
                         base = np.uintp(y * TILE + group * LANES)
                         dx0 = F(left + group * LANES) + HALF - flat[i, X]
                         for lane in range(LANES):
-                            k = base + np.uintp(lane)
+                            pixel = base + np.uintp(lane)
                             dx = dx0 + F(np.int32(lane))
-                            light, behind = acc[k], acc[k + np.uintp(PIXELS)]
+                            light, behind = acc[pixel], acc[pixel + np.uintp(PIXELS)]
                             full = peak * _exp(-min(max(HALF * a * dx * dx + across_row * dx + square, ZERO), FARTHEST))
                             alpha = min(full, OPAQUEST)
                             alpha = alpha if alpha >= FAINT and light >= STOP else ZERO
                             weight = light * alpha
-                            gr, gg, gb = acc[k + np.uintp(2 * PIXELS)], acc[k + np.uintp(3 * PIXELS)], acc[k + np.uintp(4 * PIXELS)]
+                            gr, gg, gb = acc[pixel + np.uintp(2 * PIXELS)], acc[pixel + np.uintp(3 * PIXELS)], acc[pixel + np.uintp(4 * PIXELS)]
                             own = red * gr + green * gg + blue * gb
                             behind -= weight * own
-                            acc[k], acc[k + np.uintp(PIXELS)] = light - weight, behind
+                            acc[pixel], acc[pixel + np.uintp(PIXELS)] = light - weight, behind
                             pull = alpha * (behind / (ONE - alpha) - light * own)
                             pull = pull if full < OPAQUEST else ZERO
                             q0 += pull
