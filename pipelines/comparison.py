@@ -212,9 +212,7 @@ def measure_meshes(it: Compared) -> dict[str, Any]:
     lenses = [views.intrinsics[index] for index in training]
     wanted, share = seen_surface(truth, lenses, views.world_from_camera[training], voxel, region)
     out = {}
-    for name in it.renders:
-        if name == "direct":  # shown and not made into a mesh
-            continue
+    for name in it.mesh_files():  # not of direct inference, nor of a field that is not exported as a mesh
         found = geometry_metrics(meshes.get(name, Mesh.empty()), truth, wanted, voxel, region)
         lengths = {key: value / scale for key, value in found.items() if key.startswith(("accuracy", "completeness", "voxel")) and value}
         out[name] = {**found, **lengths}

@@ -49,6 +49,9 @@ EXTRAS = (
     ("exr", "OpenEXR", "OpenEXR images and depth (.exr) are not read", "OpenEXR>=3.5"),
     ("raw", "rawpy", "camera raw files (.dng, .nef, .cr3, …) are not developed", "rawpy>=0.24"),
     ("geo", "pyproj", "UTM coordinates of captures with GPS are not written", "pyproj>=3.6"),
+    ("las", "laspy", "points are not written as LAS and LAZ", "laspy[lazrs]>=2.5"),
+    ("e57", "pye57", "points are not written as E57", "pye57>=0.4.1"),
+    ("usd", "usd-core", "the textured mesh is not written as USDZ", "usd-core>=25.2"),
     ("h264", "av", "videos are written as VP9, slowly, which not all players know", "av>=14"),
 )
 GIB = 2**30

@@ -11,12 +11,21 @@ from fieldfuse.errors import InputError
 from fieldfuse.pipelines.options import Options, Place, takes
 from fieldfuse.pipelines.work import work
 
+CROP = "off, auto, box, hull, or a box x0,y0,z0,x1,y1,z1 in the input's frame; kept for later exports of this run."
+
 
 @takes("threads config pairs quiet json")
 def export(
     place: Place,
     formats: Annotated[
         str | None, typer.Option(help=f"Comma-separated part of {','.join(EXPORTS)}.", show_default=False)
+    ] = None,
+    undistorted: Annotated[
+        bool, typer.Option("--undistorted", help="Pinhole images with cameras for nerfstudio, COLMAP and 3DGS, with --formats or alone.")
+    ] = False,
+    crop: Annotated[str | None, typer.Option(help=CROP, show_default=False)] = None,
+    clean: Annotated[
+        bool | None, typer.Option("--clean/--no-clean", help="Without parts that no two cameras see (floaters).", show_default=False)
     ] = None,
     *,
     options: Options,
@@ -29,4 +38,6 @@ def export(
     if wanted == []:
         raise InputError(f"--formats names none; give some of {', '.join(EXPORTS)}, separated by commas")
     require_formats(wanted or [], "--formats")
-    work(place, options, ("export",), options.settings(), formats=wanted)
+    if undistorted:
+        wanted = [*(wanted or []), "undistorted"]
+    work(place, options, ("export",), options.settings(**{"export.crop": crop, "export.clean": clean}), formats=wanted)

@@ -14,11 +14,16 @@ from fieldfuse import memory
 from fieldfuse.camera import Array
 from fieldfuse.capture.convert import all_converted, stored_cameras
 from fieldfuse.capture.select import SELECTED
-from fieldfuse.capture.types import Capture
+from fieldfuse.capture.types import MODEL_NAMES, Capture
 from fieldfuse.capture.unpack import folder_around
 from fieldfuse.errors import InputError
 from fieldfuse.export.cameras import write_cameras
+from fieldfuse.export.crop import LEAST_INSIDE, LEAST_KEPT, cleaned, cropped, kept_share, region_of
+from fieldfuse.export.extras import require
+from fieldfuse.export.georeference import write_georeference
+from fieldfuse.export.sparse import colours_in, points_of_field, stored_points
 from fieldfuse.export.surface import Originals, at_most, surface_of_field, whole_mesh
+from fieldfuse.export.undistorted import write_undistorted
 from fieldfuse.files import write_json
 from fieldfuse.memory import require_pictures
 from fieldfuse.pipelines.fields import Fitted
@@ -28,9 +33,9 @@ from fieldfuse.pipelines.prepare import Prepared
 from fieldfuse.pipelines.schemas import read_export_facts
 from fieldfuse.pipelines.splats import SPLAT_FILES, SPZ, remove_old_splats, splats_or_why_not
 from fieldfuse.pipelines.stages import CollectingStage
-from fieldfuse.pipelines.surfaces import put_points
+from fieldfuse.pipelines.surfaces import in_input, put_cloud, put_points
 from fieldfuse.pipelines.textured import TEXTURED, put_textured
-from fieldfuse.poses.result import PoseResult
+from fieldfuse.poses.region import Region
 from fieldfuse.tone import exposed
 
 if TYPE_CHECKING:
@@ -38,12 +43,14 @@ if TYPE_CHECKING:
 
 MESHES = ("ply", "obj", "glb")  # as `export.formats` has them
 TEXTURE = "texture"
-SURFACES = {"points", *MESHES, TEXTURE}
+TEXTURES = {TEXTURE: TEXTURED, "usdz": "textured.usdz"}
+CLOUDS = ("las", "laz", "e57")
+SURFACES = {"points", *CLOUDS, *MESHES, *TEXTURES}
+UNDISTORTED = "undistorted"
 MOST_TRIANGLES = 2_000_000
-MOST_SPARSE = 20_000  # points that go with exported cameras
 VIDEO_SIDE = 640
 FPS = 30
-REMOVED = "of an earlier field, and removed: {}; `fieldfuse export {} --formats …` exports this one"
+REMOVED = "of {}, and removed: {}; `fieldfuse export {} --formats …` exports this one"
 GONE = (
     "the folder of the capture, {}, is not there any more, and its pictures are needed; put it back (or repeat the run's own command with "
     "its new place) and run the command again"
@@ -88,24 +95,27 @@ def export_results(job: Job, ready: Prepared, fitted: Fitted, wish: Wish) -> dic
     """
     path = job.folder / "exports" / "facts.json"
     old, exported = job.stages.record("export"), Exported({})
+    part = job.settings.export.crop + (", cleaned" if job.settings.export.clean else "")
+    same_part = not path.is_file() or read_export_facts(path)["part"] == part
     formats = job.settings.export.formats if wish.formats is None else wish.formats
     splats = splats_or_why_not(job, ready, fitted, formats) if "export" not in job.stages.trusted else None
 
     def make() -> dict[str, Any]:
         nonlocal exported
-        fits = job.stages.usable("export")
+        fits = job.stages.usable("export") and same_part
         before = read_export_facts(path) if fits else None
         exported = export_field(job, ready, fitted, wish, splats)
-        stage.whole, facts = exported.whole, exported.facts
+        stage.whole, facts = exported.whole, {**exported.facts, "part": part}
         if wish.alone and not exported.made:
             raise InputError(f"nothing was exported: {'; '.join(facts['notes'])}")
         if before is not None and facts["mesh"] is None:
             facts["mesh"] = before["mesh"]
         if old is not None and not fits:
             made = {file.relative_to(job.folder.path).as_posix() for file in exported.files}
-            before_it = {Path(name).name for name in set(old.outputs) - made if name.startswith("exports/")} - {path.name}
-            gone = sorted(before_it | (remove_old_splats(job) if splats is None else set()))
-            facts["notes"] += [REMOVED.format(", ".join(gone), job.folder.path)] if gone else []
+            earlier = {Path(name).name for name in set(old.outputs) - made if name.startswith("exports/")} - {path.name}
+            gone = sorted(earlier | (remove_old_splats(job) if splats is None else set()))
+            of = "an earlier field" if same_part else "another crop"
+            facts["notes"] += [REMOVED.format(of, ", ".join(gone), job.folder.path)] if gone else []
         return facts
 
     def save(facts: dict[str, Any]) -> list[Path]:
@@ -121,6 +131,7 @@ def export_results(job: Job, ready: Prepared, fitted: Fitted, wish: Wish) -> dic
         settings=asdict(job.settings.export),
         version=3,
         only_part=wish.formats is not None,
+        renewed=not same_part,
     )
     return job.run(stage)
 
@@ -135,6 +146,13 @@ def export_field(job: Job, ready: Prepared, fitted: Fitted, wish: Wish, splats: 
     notes: list[str] = []
     out = Exported({"mesh": None, "notes": notes})
     undone: set[str] = set()
+    fitted, region = shown_part(job, ready, fitted, notes, wish.alone)
+    for name in sorted(formats):
+        try:
+            require(name)
+        except InputError as error:
+            undone.add(name)
+            notes.append(f"{name} was left out: {error}")
     for what, names, side in needs_originals(job, formats):
         gone = missing_originals(job, ready, side)
         if gone is not None and names - undone:
@@ -143,14 +161,24 @@ def export_field(job: Job, ready: Prepared, fitted: Fitted, wish: Wish, splats: 
     out.whole = not undone
     if surfaces := (formats - undone) & SURFACES:
         try:
-            out.facts["mesh"], out.files = export_surface(job, ready, fitted, surfaces, notes)
-            undone |= {TEXTURE} - {TEXTURE for path in out.files if path.name == TEXTURED}
+            out.facts["mesh"], out.files = export_surface(job, ready, (fitted, region), surfaces, notes)
+            undone |= {name for name, file in TEXTURES.items() if folder / file not in out.files}
         except InputError as error:
             undone |= surfaces
             notes.append(f"points and meshes were left out: {error}")
-    if "cameras" in formats:
-        put_cameras(folder / "cameras", ready.poses, ready.posed, *sparse_points(folder / "points.ply"))
-        out.files += [path for path in sorted((folder / "cameras").rglob("*")) if path.is_file()]
+    if ready.poses.georeference is not None:
+        out.files += write_georeference(folder, ready.poses.georeference)
+    if wanted := (formats - undone) & {"cameras", UNDISTORTED}:
+        sparse = starting_points(job, ready, fitted)
+        if "cameras" in wanted:
+            put_cameras(folder / "cameras", ready.posed, *sparse)
+            out.files += [path for path in sorted((folder / "cameras").rglob("*")) if path.is_file()]
+        if UNDISTORTED in wanted:
+            try:
+                out.files += write_undistorted(folder / UNDISTORTED, ready.posed, *sparse, views.test, job.progress)
+            except InputError as error:
+                undone, out.whole = undone | {UNDISTORTED}, False
+                notes.append(f"undistorted images were left out: {error}")
     if PAGE in formats:
         try:
             out.files.append(put_page(job, folder / NAME, fitted.field, views, scene))
@@ -175,8 +203,43 @@ def export_field(job: Job, ready: Prepared, fitted: Fitted, wish: Wish, splats: 
     return out
 
 
+def shown_part(job: Job, ready: Prepared, fitted: Fitted, notes: list[str], strict: bool) -> tuple[Fitted, Region | None]:
+    """The field as `export.crop` and `export.clean` have it exported, and the region (working frame), if it was cropped; `notes` gets what
+    was done, or why it was not.
+
+    Raises:
+        InputError: with `strict`, a crop that is not possible.
+    """
+    settings, views, whole = job.settings.export, ready.training, fitted.field
+    if settings.clean:
+        part = cleaned(whole, views.intrinsics, views.world_from_camera, job.progress)
+        notes.append(f"floaters: {whole.voxels - part.voxels} of {whole.voxels} voxels were left out of exports")
+        whole = part
+    if settings.crop == "off":
+        return replace(fitted, field=whole), None
+    try:
+        region = region_of(settings.crop, ready.scene, views)
+        if region is None:
+            notes.append("export.crop=auto cropped nothing, since the cameras do not look at one object")
+            return replace(fitted, field=whole), None
+        part = cropped(whole, region)
+        kept, inside = kept_share(whole, part, region, views)
+        if part.voxels == 0:
+            raise InputError("nothing of the field lies in the region; its numbers are in the frame of the input, as points.ply has it")
+        if settings.crop == "auto" and (kept < LEAST_KEPT or inside < LEAST_INSIDE):
+            raise InputError(f"{100 * kept:.0f}% of what training images show would stay, and {100 * inside:.0f}% of what lies in the box")
+    except InputError as error:
+        if strict and settings.crop != "auto":
+            job.folder.restore()  # the next export does not try it again
+            raise InputError(f"export.crop={settings.crop} is not possible: {error}") from error
+        notes.append(f"nothing was cropped: {error}")
+        return replace(fitted, field=whole), None
+    notes.append(f"exports are cropped ({settings.crop}): they hold {100 * kept:.0f}% of what training images show")
+    return replace(fitted, field=part), region
+
+
 def export_surface(
-    job: Job, ready: Prepared, fitted: Fitted, formats: set[str], notes: list[str]
+    job: Job, ready: Prepared, part: tuple[Fitted, Region | None], formats: set[str], notes: list[str]
 ) -> tuple[dict[str, Any], list[Path]]:
     """The field's depth at the training cameras, polished by their images as they were taken and fused: points and meshes of the region of
     interest; `notes` gets a sentence when the texture had to be left out.
@@ -187,11 +250,20 @@ def export_surface(
     from fieldfuse.export.mesh import mesh_facts, write_mesh
 
     folder, exposure = job.folder / "exports", ready.views.exposure
+    fitted, region = part
     originals = Originals(ready.posed, ready.corrections)
-    volume = surface_of_field(fitted.field, ready.views, ready.scene, job.settings, originals, job.progress)
+    volume = surface_of_field(fitted.field, ready.views, ready.scene, job.settings, originals, job.progress, region)
     memory.give_back()  # what images and depth maps took
     input_from_working = ready.scene.working_from_input.inverse()
-    written = [put_points(folder / "points.ply", volume.points(), input_from_working, exposure)] if "points" in formats else []
+    written = []
+    if formats & {"points", *CLOUDS}:
+        points = volume.points()
+        written += [put_points(folder / "points.ply", points, input_from_working, exposure)] if "points" in formats else []
+        for path in [folder / f"points.{kind}" for kind in CLOUDS if kind in formats]:
+            note = put_cloud(path, in_input(points, input_from_working, exposure), ready.poses.georeference)
+            notes += [] if note is None else [note]
+            written.append(path)
+        del points
     whole = whole_mesh(volume, job.settings.export.smooth)
     del volume
     mesh = whole.decimated(MOST_TRIANGLES).transformed(input_from_working)
@@ -200,23 +272,23 @@ def export_surface(
     for path in [job.folder / "mesh.ply", *(folder / f"mesh.{suffix}" for suffix in MESHES if suffix in formats)]:
         write_mesh(path, mesh)
         written.append(path)
-    if TEXTURE in formats:
+    if wanted := [folder / file for kind, file in TEXTURES.items() if kind in formats]:
         memory.give_back()
         try:
             # People who walk through belong into a texture as little as into the field.
             shown = ready if fitted.left_out is None else replace(ready, views=fitted.left_out.without(ready.views))
-            written.append(put_textured(job, shown, folder / TEXTURED, whole))
+            put_textured(job, shown, wanted, whole)
+            written += wanted
         except InputError as error:
             notes.append(f"the texture was left out: {error}")
     return facts, written
 
 
-def put_cameras(folder: Path, poses: PoseResult, posed: Capture, points: Array | None = None, colours: Array | None = None) -> None:
+def put_cameras(folder: Path, posed: Capture, points: Array | None = None, colours: Array | None = None) -> None:
     """Cameras as transforms.json and COLMAP text, to be put into the capture's folder: for the images as they lie there.
 
     Args:
-        points, colours: (P, 3) of a surface in the input's frame, for poses that came without points: programs that start from points
-            need some.
+        points, colours: (P, 3) in the input's frame, and their colours (None: grey).
     """
     cut = all(frame.instant is not None for frame in posed.frames)
     made_here = cut or SELECTED in posed.extra or all_converted(posed)  # then the images lie in the run's folder
@@ -225,28 +297,29 @@ def put_cameras(folder: Path, poses: PoseResult, posed: Capture, points: Array |
     bases = (root, root.resolve())
     paths = [frame.image for frame in posed.frames]
     files = [next((path.relative_to(base).as_posix() for base in bases if path.is_relative_to(base)), str(path)) for path in paths]
+    known = {} if made_here else posed.extra.get(MODEL_NAMES, {})
+    names = [known.get(frame.name, file) for frame, file in zip(posed.frames, files, strict=True)]
     # Those of the frames that take part, which may be fewer than have a pose.
     intrinsics, world_from_camera = stored_cameras(posed)
-    if poses.points is not None and len(poses.points):
-        points, colours = poses.points, None
-    write_cameras(folder, files, intrinsics, world_from_camera, points, colours)
+    write_cameras(folder, files, intrinsics, world_from_camera, points, colours, names)
 
 
-def sparse_points(path: Path) -> tuple[Array, Array] | tuple[None, None]:
-    """At most `MOST_SPARSE` points (P, 3) of an exported cloud, evenly chosen, and their colours (P, 3) uint8; None where there is none."""
-    import trimesh
-
-    if not path.is_file():
-        return None, None
-    cloud: Any = trimesh.load(path, process=False)
-    chosen = np.linspace(0, len(cloud.vertices) - 1, min(MOST_SPARSE, len(cloud.vertices))).astype(int)
-    return np.asarray(cloud.vertices)[chosen], np.asarray(cloud.colors)[chosen, :3]
+def starting_points(job: Job, ready: Prepared, fitted: Fitted) -> tuple[Array, Array]:
+    """(P, 3) points in the input's frame, and their colours (P, 3) uint8, for programs that start from some: those that came with the
+    poses, else of the surface that was exported, else of renders of the field."""
+    views, working, points = ready.training, ready.scene.working_from_input, ready.poses.points
+    if points is not None and len(points):
+        return points, exposed(colours_in(working.points(points), views), views.exposure)
+    if (stored := stored_points(job.folder / "exports" / "points.ply")) is not None and len(stored[0]):
+        return stored
+    points, colours = points_of_field(fitted.field, views, job.settings.engine)
+    return working.inverse().points(points), exposed(colours, views.exposure)
 
 
 def needs_originals(job: Job, formats: Iterable[str]) -> list[tuple[str, set[str], int]]:
     """What of `formats` is made of images as they were taken: how a sentence on it begins, the formats, and the images' long side."""
     surfaces, export = SURFACES & set(formats), job.settings.export
-    found = [("points and meshes were", surfaces, export.mesh_size), ("the texture was", surfaces & {TEXTURE}, export.texture_size)]
+    found = [("points and meshes were", surfaces, export.mesh_size), ("the texture was", surfaces & TEXTURES.keys(), export.texture_size)]
     return [one for one in found if one[1]]
 
 

@@ -24,6 +24,7 @@ OUTDATED = (
     ({"splats", "splats_render"}, "the splats are of an earlier field; `fieldfuse export {} --formats splat` renews them"),
     ({"export"}, "the exports are of an earlier field; `fieldfuse export {}` renews them"),
 )
+LENGTHS = {True: "in metres", False: "without a unit; --scale, --marker, or the images' GPS give metres"}
 STAGE = ("name", "seconds", "peak_memory_mb", "stopped")
 BESIDE = 140  # characters that a line must have for the evidence to stand in the table
 SHOWN = {"views": "views {}", "psnr": "PSNR {:.2f} dB", "ssim": "SSIM {:.3f}", "lpips": "LPIPS {:.3f}"}
@@ -85,12 +86,25 @@ def source_facts(source: Path, fast: bool, quiet: bool, depth_scale: str | None 
         "test": sum(frame.split == "test" for frame in capture.frames),
         "points": 0 if capture.points is None else len(capture.points),
         "ordered": capture.ordered,
+        "gps": with_gps(capture),
+        "lengths": LENGTHS[capture.metric or (capture.has_depth and not capture.posed)],
         "depth_scale": capture.depth_scale if capture.has_depth else None,
         "unused": unused(capture),
         "alpha": None if fast else see_through(capture),
         "poses": agreement,
         "warnings": list(capture.warnings),
     }
+
+
+def with_gps(capture: Capture) -> str | None:
+    """How many images have a place with altitude, in words; None: no image has."""
+    import numpy as np
+
+    from fieldfuse.capture.gps import gps_of_images
+
+    images = [frame.image for frame in capture.frames if frame.video_index is None]
+    count = int(np.isfinite(gps_of_images(images)).all(axis=1).sum())
+    return f"{count} of {len(images)} images have a place on earth" if count else None
 
 
 def see_through(capture: Capture) -> str | None:

@@ -113,10 +113,11 @@ def in_run(capture: Capture, job: Job) -> Capture:
     def here(path: Path) -> Path:
         return now / path.relative_to(before) if path.is_relative_to(before) else path
 
-    frames = [
-        replace(frame, **{name: here(path) for name in PATHS if (path := getattr(frame, name)) is not None}) for frame in capture.frames
-    ]
-    return replace(capture, root=here(capture.root), frames=tuple(frames))
+    def moved(frame: Frame) -> Frame:
+        paths: dict[str, Any] = {name: here(path) for name in PATHS if (path := getattr(frame, name)) is not None}
+        return replace(frame, **paths)
+
+    return replace(capture, root=here(capture.root), frames=tuple(map(moved, capture.frames)))
 
 
 def choose_frames(job: Job, capture: Capture) -> Capture:

@@ -92,7 +92,7 @@ Network = table(
     first_preview_seconds=Number,
     resolution=Number,
 )
-ExportFacts = table("ExportFacts", mesh=Mesh | None, notes=(Many[str], []), note=Text)
+ExportFacts = table("ExportFacts", mesh=Mesh | None, notes=(Many[str], []), note=Text, part=(str, "off"))
 CompareScores = table(
     "CompareScores", scores=EVALUATION, geometry=ByName[str, Numbers] | None, seen_share=Maybe, matching=Numbers | None
 )

@@ -105,6 +105,8 @@ def picture_size(capture: Capture) -> tuple[int | None, int | None]:
 
 def describe_capture(capture: Capture) -> dict[str, Any]:
     """The report's part `capture`."""
+    from fieldfuse.capture.types import MODEL_NAMES
+
     width, height = picture_size(capture)
     return {
         "kind": capture.kind,
@@ -115,5 +117,5 @@ def describe_capture(capture: Capture) -> dict[str, Any]:
         "depth": sum(frame.depth is not None for frame in capture.frames),
         "masks": sum(frame.mask is not None for frame in capture.frames),
         "metric": capture.metric,
-        "extra": capture.extra,
+        "extra": {name: value for name, value in capture.extra.items() if name != MODEL_NAMES},
     }

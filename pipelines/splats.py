@@ -54,21 +54,25 @@ def make_splats(job: Job, ready: Prepared, fitted: Fitted) -> Splats:
         InputError: none can be made of this field.
         Interrupted: the user asked to stop.
     """
+    from fieldfuse.export.crop import region_of
     from fieldfuse.render.splat_files import open_splats, save_splats
     from fieldfuse.training.splats import SplatSettings, splats_of_field
 
     path, export = job.folder / "exports" / SPLAT_FILES[SPLAT], job.settings.export
     settings = SplatSettings(export.splats, export.sh_degree, export.splat_seconds, job.settings.seed)
+    frame = ready.scene.working_from_input
     views = ready.views if fitted.left_out is None else fitted.left_out.without(ready.views)
 
     def make() -> Splats:
-        return splats_of_field(fitted.field, views, ready.scene.working_from_input, settings, job.progress)
+        made, region = splats_of_field(fitted.field, views, frame, settings, job.progress), region_of(export.crop, ready.scene, views)
+        # The steps need all that the images show; what is not wanted goes afterwards.
+        return made if region is None else made.take(region.inside(frame.points(made.centres)))
 
     def save(splats: Splats) -> list[Path]:
         save_splats(path, splats)
         return [path]
 
-    chosen = [settings.most, settings.degree, settings.seconds, settings.seed]
+    chosen = [settings.most, settings.degree, settings.seconds, settings.seed, export.crop]
     return job.run(StoredStage(SPLATS, make, save, lambda: open_splats(path), ["field", "scene", "views"], chosen))
 
 

@@ -119,17 +119,19 @@ class CollectingStage(Stage[T]):
     Attributes:
         only_part: a part of the result is wanted, and made whether there is one or not.
         whole: whether `make` made everything. A part is made again when the whole is wanted; added to a whole it leaves it whole.
+        renewed: files of an earlier result do not fit those that are made now, and go.
     """
 
     only_part: bool = False
     whole: bool = True
+    renewed: bool = False
 
     def reusable(self, record: Record, key: str, trusted: bool) -> bool:
         return not self.only_part and super().reusable(record, key, trusted)
 
     def recorded(self, record: Record, old: Record | None, complete: bool, folder: RunFolder) -> Record:
         outputs, key = record.outputs, record.key
-        if old is not None and old.after == record.after:
+        if old is not None and old.after == record.after and not self.renewed:
             outputs = {path: size for path, size in old.outputs.items() if (folder / path).is_file()} | outputs
         was_whole = old is not None and complete and old.key == key and not old.stopped
         if (self.only_part or not self.whole) and not was_whole:

@@ -19,6 +19,8 @@ from fieldfuse.effects.correct import apart
 from fieldfuse.evaluation.failure import failures
 from fieldfuse.evaluation.pictures import method_pictures, moving_pictures
 from fieldfuse.evaluation.report import report_data
+from fieldfuse.export.georeference import write_georeference
+from fieldfuse.export.sparse import thinned
 from fieldfuse.files import write_json
 from fieldfuse.pipelines.exports import put_cameras
 from fieldfuse.pipelines.fields import Fitted
@@ -32,6 +34,7 @@ from fieldfuse.pipelines.splats import SPLATS
 from fieldfuse.pipelines.textured import TSDF_TEXTURE
 from fieldfuse.pipelines.total_budget import TotalBudget
 from fieldfuse.poses.result import PoseResult
+from fieldfuse.poses.scene import find_cloud
 from fieldfuse.stereo.transients import LeftOut
 
 SEEN_BY_SFM = "poses were estimated from all images, the held-out ones included, so scores are slightly optimistic"
@@ -51,7 +54,7 @@ SEES = {
     "full": "colours depend on the direction of view",
 }
 POSES = ("source", "registered", "total", "models", "missing", "seconds", "agreement", "metric", "scaling")
-OPENED = {".html", ".ply", ".spz", ".obj", ".glb", ".mp4", ".txt", ".json"}
+OPENED = {".html", ".ply", ".spz", ".obj", ".glb", ".usdz", ".las", ".laz", ".e57", ".mp4", ".txt", ".json"}
 NO_TEST_VIEWS = "no image was held out, so there are no scores; give --holdout 8 to keep every 8th image for testing"
 
 
@@ -74,7 +77,13 @@ def base_data(job: Job, capture: Capture, poses: PoseResult) -> dict[str, Any]:
 
 def summarise_poses(job: Job, capture: Capture, poses: PoseResult) -> dict[str, Any]:
     """Cameras written for other programs, and what was found."""
-    put_cameras(job.folder / "exports" / "cameras", poses, poses.apply(capture))
+    posed, points = poses.apply(capture), poses.points
+    if points is None or not len(points):  # programs that start from points need some
+        points = find_cloud(posed, job.progress).points
+        points = points[thinned(points)]
+    put_cameras(job.folder / "exports" / "cameras", posed, points)
+    if poses.georeference is not None:
+        write_georeference(job.folder / "exports", poses.georeference)
     data = base_data(job, capture, poses)
     return {**data, "warnings": unique([*capture.warnings, *poses.warnings]), "exports": [{"path": "exports/cameras/transforms.json"}]}
 

@@ -29,6 +29,7 @@ from fieldfuse.stereo.plane_completion import continued
 from fieldfuse.tone import exposed
 
 if TYPE_CHECKING:
+    from fieldfuse.georeference import Georeference
     from fieldfuse.tsdf.mesh import Mesh
     from fieldfuse.tsdf.volume import Points, TsdfVolume
 
@@ -170,12 +171,36 @@ def write_surface(ready: Prepared, folder: Path, mesh: Mesh, points: Points) -> 
 
 
 def put_points(path: Path, points: Points, input_from_working: Similarity, exposure: float) -> Path:
-    """Points of the working frame as a file in the input's, brighter by `exposure`."""
+    """Points of the working frame as a .ply file in the input's, brighter by `exposure`."""
     from fieldfuse.export.ply import write_points
 
-    colours = exposed(points.colours, exposure)
-    write_points(path, input_from_working.points(points.points), colours, input_from_working.directions(points.normals))
+    found = in_input(points, input_from_working, exposure)
+    write_points(path, found.points, found.colours, found.normals)
     return path
+
+
+def in_input(points: Points, input_from_working: Similarity, exposure: float) -> Points:
+    """Points of the working frame in the input's, brighter by `exposure`."""
+    places, normals = input_from_working.points(points.points), input_from_working.directions(points.normals)
+    return replace(points, points=places, colours=exposed(points.colours, exposure), normals=normals)
+
+
+def put_cloud(path: Path, points: Points, place: Georeference | None) -> str | None:
+    """Points of the input's frame as .las, .laz or .e57: where the frame's place on earth is known in UTM coordinates with their reference
+    system, else as they are. Answers a sentence where they could not become UTM coordinates."""
+    from fieldfuse.export.clouds import write_cloud
+
+    crs, note = None, None
+    if place is not None:
+        try:
+            linear, crs = place.utm_from_input()[:3, :3], place.epsg
+            normals = points.normals @ np.linalg.inv(linear)
+            normals = normals / np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), 1e-12)
+            points = replace(points, points=place.to_utm(points.points), normals=normals)
+        except InputError as error:
+            note = f"{path.name} has the coordinates of the input, not those of its UTM zone: {error}"
+    write_cloud(path, points.points, points.colours, points.normals, crs)
+    return note
 
 
 def render_views(job: Job, views: Views, render: Callable[[Intrinsics, Array], Any]) -> Pictures:

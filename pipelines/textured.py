@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -30,17 +31,19 @@ def texture_tsdf(job: Job, ready: Prepared) -> None:
         from fieldfuse.evaluation.geometry import read_mesh
 
         mesh = read_mesh(path.with_name("mesh.ply")).transformed(ready.scene.working_from_input)
-        return put_textured(job, ready, path, mesh.with_normals())
+        put_textured(job, ready, [path], mesh.with_normals())
+        return path
 
     settings = [job.settings.export.texture_size, TRIANGLES]
     job.run(Stage(TSDF_TEXTURE, make, lambda made: [made], lambda: path, ["tsdf", "views"], settings, version=2))
 
 
-def put_textured(job: Job, ready: Prepared, path: Path, mesh: Mesh) -> Path:
-    """A coarser mesh (working frame, with normals) with a texture of the training pictures, in the input's frame."""
+def put_textured(job: Job, ready: Prepared, paths: Iterable[Path], mesh: Mesh) -> None:
+    """A coarser mesh (working frame, with normals) with a texture of the training pictures, in the input's frame, as .glb or .usdz."""
     from fieldfuse import memory
     from fieldfuse.export.mesh import write_textured
     from fieldfuse.export.texture import LARGEST, Photos, textured
+    from fieldfuse.export.usd import write_usdz
 
     largest = LARGEST
     while largest > 1024 and TEXEL_BYTES * largest**2 > memory.bounded(TEXEL_BYTES * LARGEST**2):
@@ -50,5 +53,7 @@ def put_textured(job: Job, ready: Prepared, path: Path, mesh: Mesh) -> Path:
     lenses, images = Originals(ready.posed, ready.corrections).at(train, shown, job.settings.export.texture_size)
     photos = Photos(images, lenses, shown.world_from_camera, shown.valid, shown.weight)
     atlas, texture = textured(thin, photos, largest, job.progress)
-    write_textured(path, thin, atlas, exposed(texture, ready.views.exposure), ready.scene.working_from_input)
-    return path
+    texture = exposed(texture, ready.views.exposure)
+    for path in paths:
+        write = write_usdz if path.suffix == ".usdz" else write_textured
+        write(path, thin, atlas, texture, ready.scene.working_from_input)

@@ -21,7 +21,7 @@ from fieldfuse.errors import FieldfuseError
 from fieldfuse.evaluation import budget as model
 from fieldfuse.evaluation.budget_probe import self_test
 from fieldfuse.files import fingerprint, read_json, write_json
-from fieldfuse.pipelines.exports import TEXTURE
+from fieldfuse.pipelines.exports import SURFACES, TEXTURE
 from fieldfuse.pipelines.job import Job
 from fieldfuse.pipelines.pictures import PAGE
 from fieldfuse.pipelines.prepare import Prepared
@@ -240,7 +240,7 @@ class TotalBudget:
         video = export.video_frames if "video" in export.formats else 0
         finest = replace(self.choice, mesh_size=export.mesh_size)
         most = model.most_export_seconds(self.speed, self.work, finest, export.mesh_views, video)
-        surface = bool({"points", "ply", "obj", "glb", "texture"} & set(export.formats))
+        surface = bool(SURFACES & set(export.formats))
         least = min(most, model.least_export_seconds(self.speed, self.work, self.choice)) if surface else 0.0
         return max(least, min(model.EXPORT_SHARE * max(0.0, left), most))
 

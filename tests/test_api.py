@@ -87,6 +87,19 @@ def test_a_field_is_saved_opened_and_meshed(scene: ff.Scene, fitted: ff.Field, t
     assert np.median(off) < 0.03, "the mesh is not where the room's walls are"
 
 
+def test_a_field_is_cropped_and_cleaned(scene: ff.Scene, fitted: ff.Field, tmp_path: Path) -> None:
+    part, clean = fitted.cropped("-9,-9,-9,9,9,0"), fitted.cleaned()
+    assert 0.2 < part.sparse.voxels / fitted.sparse.voxels < 0.8 and clean.sparse.voxels <= fitted.sparse.voxels
+    camera = scene.train.cameras[0]
+    assert np.abs(clean.render(camera).opacity - fitted.render(camera).opacity).mean() < 0.01
+    assert part.render(camera).opacity.mean() < fitted.render(camera).opacity.mean()
+    with pytest.raises(ff.InputError, match="nothing of the field lies in the region"):
+        fitted.cropped("50,50,50,51,51,51")
+    fitted.save(tmp_path / "field.safetensors")
+    with pytest.raises(ff.InputError, match="has no scene"):
+        ff.Field.open(tmp_path / "field.safetensors").cropped()
+
+
 def test_sensor_depth_is_fused(scene: ff.Scene, tmp_path: Path) -> None:
     surface = ff.fuse_tsdf(scene, voxel_size=0.04)
     rendered, (_, depth) = surface.render(scene.test.cameras[0]), shoot(circle(12)[0])
@@ -180,7 +193,7 @@ def test_splats_show_what_the_field_shows(scene: ff.Scene, fitted: ff.Field, tmp
     with steady():
         splats = fitted.to_splats(splat_seconds=1)
     ours, theirs = ff.evaluate(splats, scene), ff.evaluate(fitted, scene)
-    assert ours.psnr is not None and theirs.psnr is not None and ours.psnr > theirs.psnr - 4  # a Gaussian a coarse voxel shows less than the field, which interpolates
+    assert ours.psnr is not None and theirs.psnr is not None and ours.psnr > theirs.psnr - 4  # of coarse voxels
     camera = scene.test.cameras[0]
     shown, depth = splats.render(camera), shoot(circle(12)[0])[1]
     assert np.median(np.abs(shown.depth - depth)) < 0.1 and np.median(shown.opacity) > 0.95

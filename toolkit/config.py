@@ -372,8 +372,34 @@ class TsdfSettings:
 # Files for other programs: "texture" is a mesh with one (textured.glb), "page" the field itself for any browser (field.html), the others
 # are named as they end, or as what they hold.
 DEFAULT_EXPORTS = ("points", "ply", "obj", "glb", "texture", "page", "cameras", "video")
-MORE_EXPORTS: tuple[str, ...] = ("splat", "spz")  # made when they are named
+# Made when they are named: points as LAS, LAZ or E57, the textured mesh as USDZ (these need extras), pinhole images with cameras,
+# Gaussian splats.
+MORE_EXPORTS: tuple[str, ...] = ("las", "laz", "e57", "usdz", "undistorted", "splat", "spz")
 EXPORTS: tuple[str, ...] = (*DEFAULT_EXPORTS, *MORE_EXPORTS)
+
+
+def crop_box(text: str) -> tuple[list[float], list[float]] | None:
+    """Lowest and highest corner (3,) of a box that is given by six numbers, `x0,y0,z0,x1,y1,z1`; None where the text is something else."""
+    try:
+        values = [float(part) for part in text.split(",")]
+    except ValueError:
+        return None
+    if len(values) != 6 or not all(abs(value) < 1e12 for value in values):  # not of what is not a number
+        return None
+    ends = [sorted(pair) for pair in zip(values[:3], values[3:], strict=True)]
+    return [low for low, _ in ends], [high for _, high in ends]
+
+
+def _check_crop(value: Any) -> Any:
+    value = "off" if value is False else value
+    box = crop_box(value) if isinstance(value, str) else None
+    if value not in CROPS and (box is None or not all(low < high for low, high in zip(*box, strict=True))):
+        sentence = f"it must be one of {', '.join(CROPS)}, or a box as x0,y0,z0,x1,y1,z1 in the frame of the input"
+        raise PydanticCustomError("choice", "{sentence}", {"sentence": sentence})
+    return value
+
+
+CROPS = ("off", "auto", "box", "hull")
 
 
 @dataclass
@@ -389,6 +415,10 @@ class ExportSettings:
     splats: Positive = 150_000  # Gaussians at most, of voxels that training views see
     sh_degree: Annotated[int, Field(ge=0, le=3)] = 1  # of the spherical harmonics of their colours
     splat_seconds: Annotated[float, Field(ge=0, lt=10**9)] = 30.0  # of steps on the training images; 0: none
+    # What is exported of the field. off: all | box: what lies in the region of interest | hull: what half of the cameras see of that
+    # | auto: the box where the cameras look at an object, else all | x0,y0,z0,x1,y1,z1: a box in the frame of the input
+    crop: Annotated[str, BeforeValidator(_check_crop)] = "off"
+    clean: bool = False  # without parts that are connected to nothing that two cameras see
 
 
 @dataclass

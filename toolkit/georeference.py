@@ -79,6 +79,11 @@ class Georeference:
         up = [math.cos(north) * math.cos(east), math.cos(north) * math.sin(east), math.sin(north)]
         return np.array([turn, np.cross(up, turn), up])
 
+    def enu_from_ecef(self) -> Similarity:
+        """Metres east, north and up of the origin from geocentric metres."""
+        axes = self._axes()
+        return Similarity(1.0, axes, -(axes @ ecef(self.origin)))
+
     def to_enu(self, points: Array) -> Array:
         """(..., 3) points in the frame of exports → (..., 3) metres east, north and up of the origin, float64."""
         return self.enu_from_input.points(points)
@@ -162,12 +167,27 @@ class Georeference:
                 latitude=float(data["latitude"]),
                 longitude=float(data["longitude"]),
                 altitude=float(data["altitude"]),
-                enu_from_input=Similarity.from_dict(data["enu_from_input"]),
+                enu_from_input=usable_similarity(data["enu_from_input"]),
                 source=str(data["source"]),
                 error=None if data["error"] is None else float(data["error"]),
             )
-        except (KeyError, TypeError, ValueError) as error:
+        except (KeyError, TypeError, ValueError, OverflowError) as error:
             raise InputError(f"the georeference is not what a run writes ({first_line(error)}); find the poses again") from error
+
+
+def usable_similarity(data: Any) -> Similarity:
+    """A similarity from plain data.
+
+    Raises:
+        ValueError, TypeError or KeyError: it is none.
+    """
+    made = Similarity.from_dict(data)
+    shapes = made.rotation.shape == (3, 3) and made.translation.shape == (3,)
+    if not (shapes and 0 < made.scale < np.inf and np.isfinite(made.translation).all() and (np.abs(made.rotation) <= 1 + 1e-6).all()):
+        raise ValueError("a similarity needs a positive scale, a rotation and a translation")
+    if not np.allclose(made.rotation @ made.rotation.T, np.eye(3), atol=1e-6):
+        raise ValueError("the rotation of a similarity is none")
+    return made
 
 
 def _pyproj() -> Any:

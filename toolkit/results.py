@@ -304,6 +304,38 @@ class Field(Renderable):
         settings = SplatSettings(export.splats, export.sh_degree, export.splat_seconds, chosen.seed)
         return Splats(splats_of_field(self.sparse, scene.views, self.working_from_input, settings, listener))
 
+    def cropped(self, region: str = "auto") -> Field:
+        """The part in a region, as the setting `export.crop` has it: "box", "hull", "auto", or "x0,y0,z0,x1,y1,z1" in the source's frame.
+
+        Raises:
+            InputError: it was opened without its scene, there is no such region, or nothing lies in it.
+        """
+        from fieldfuse.export.crop import cropped, region_of
+
+        scene, views = self._trained()
+        found = region_of(load_settings(flags={"export.crop": region}).export.crop, scene.geometry, views)
+        part = self.sparse if found is None else cropped(self.sparse, found)
+        if part.voxels == 0:
+            raise InputError(f"nothing of the field lies in the region {region}; its numbers are in the frame of the source")
+        return replace(self, sparse=part)
+
+    def cleaned(self, progress: Listener = None) -> Field:
+        """Without floaters: parts that are connected to nothing that two cameras see, and what no camera sees.
+
+        Raises:
+            InputError: it was opened without its scene.
+        """
+        from fieldfuse.export.crop import cleaned
+
+        _, views = self._trained()
+        return replace(self, sparse=cleaned(self.sparse, views.intrinsics, views.world_from_camera, listening(progress, "floaters")))
+
+    def _trained(self) -> tuple[Scene, Views]:
+        """The scene, and its training views."""
+        if self.scene is None:
+            raise InputError("this is decided at the training cameras, and this field has no scene; use Field.open(path, scene)")
+        return self.scene, self.scene.views.subset(np.flatnonzero(~np.asarray(self.scene.views.test)))
+
     def save(self, path: Path | str) -> None:
         """Write the field (`.safetensors`).
 

@@ -15,6 +15,7 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from fieldfuse.camera import Array
+from tests.capture import programs
 from tests.capture.films import film
 from tests.capture.made import Eye, Pinhole, eyes, render, save_depth, save_picture
 
@@ -358,6 +359,14 @@ LAYOUTS: dict[str, tuple[str, Callable[[Path], Pinhole]]] = {
     "stray": ("stray", write_stray),
     "record3d": ("record3d", write_record3d),
     "scanner3d": ("scanner3d", write_scanner3d),
+    "metashape": ("metashape", programs.write_metashape),
+    "realitycapture": ("realitycapture", programs.write_realitycapture),
+    "xmp": ("realitycapture", programs.write_xmp),
+    "opensfm": ("opensfm", programs.write_opensfm),
+    "meshroom": ("meshroom", programs.write_meshroom),
+    "bundler": ("bundler", programs.write_bundler),
+    "scannetpp": ("scannetpp", programs.write_scannetpp),
+    "arkitscenes": ("arkitscenes", programs.write_arkitscenes),
 }
 
 

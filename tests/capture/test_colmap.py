@@ -13,6 +13,7 @@ import pytest
 from fieldfuse.camera import Intrinsics, project
 from fieldfuse.capture import open_capture
 from fieldfuse.capture.colmap import MODELS, candidate_capture, candidate_models, intrinsics_of, read_colmap, read_model
+from fieldfuse.capture.types import MODEL_NAMES
 from fieldfuse.errors import InputError
 from tests.capture.layouts import OFF_CENTRE, POINTS, half_size, write_colmap_bin, write_colmap_txt
 from tests.capture.made import eyes, pixel_error, render, save_picture
@@ -29,6 +30,7 @@ PARAMETERS = {
     "RADIAL_FISHEYE": [70, 41, 29, 0.08, -0.03],
     "SIMPLE_FISHEYE": [70, 41, 29],
     "FISHEYE": [70, 72, 41, 29],
+    "EQUIRECTANGULAR": [80, 60],
 }
 
 
@@ -74,7 +76,7 @@ def test_what_pycolmap_writes(tmp_path: Path, suffix: str) -> None:
     np.testing.assert_allclose(sorted(capture.points.tolist()), sorted(POINTS.tolist()))
 
 
-@pytest.mark.parametrize("place", ["sparse/0", "sparse", "colmap/sparse/0", "colmap/sparse", "."])
+@pytest.mark.parametrize("place", ["sparse/0", "sparse", "colmap/sparse/0", "colmap/sparse", "distorted/sparse/0", "."])
 def test_places_of_the_model(tmp_path: Path, place: str) -> None:
     write_colmap_bin(tmp_path)
     if place != "sparse/0":
@@ -124,7 +126,10 @@ def test_missing_and_unregistered_pictures_are_counted(tmp_path: Path) -> None:
     write_colmap_bin(tmp_path)
     (tmp_path / "images/view 3.png").rename(tmp_path / "images/other.png")
     capture = open_capture(tmp_path)
+    names = capture.extra.pop(MODEL_NAMES)
     assert capture.extra == {"listed": 5, "missing": 1, "unregistered": 1}
+    assert set(names) == {frame.name for frame in capture.frames}
+    assert all(frame.image.as_posix().endswith(names[frame.name]) for frame in capture.frames)
     assert len(capture.warnings) == 2
     for path in (tmp_path / "images").iterdir():
         path.unlink()
@@ -223,6 +228,9 @@ def move(root: Path, *moves: tuple[str, str]) -> None:
         ([("images", "dense/0/images"), ("sparse/0", "dense/0/sparse")], None),
         ([("images", "scene/images"), ("sparse", "scene/sparse")], "the capture was found in scene"),
         ([("sparse/0", "distorted/sparse/1")], None),
+        ([("sparse/0", "dense/0")], "the COLMAP model was found in dense/0"),
+        ([("sparse/0", "dense/sparse")], None),
+        ([("sparse/0", "dense/0"), ("images", "dense/0/images")], "the capture was found in dense/0"),
     ],
 )
 def test_where_models_and_images_are_found(tmp_path: Path, moves: list[tuple[str, str]], said: str | None) -> None:

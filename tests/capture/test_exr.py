@@ -133,7 +133,7 @@ def exr_room(folder: Path) -> Path:
         depth = np.full((data["h"], data["w"]), 1 + number / 4, np.float32)
         write_exr(folder / f"{number}.exr", {"Z": depth})
         entry["depth_file_path"] = f"{number}.exr"
-    path.write_text(json.dumps({**data, "depth_unit_scale_factor": 1.0}))
+    path.write_text(json.dumps(data))
     return folder
 
 

@@ -31,6 +31,14 @@ FILES = {
     "stray": ("odometry.csv", "camera_matrix.csv"),
     "record3d": ("metadata",),
     "scanner3d": ("frame_00002.json",),
+    "metashape": ("cameras.xml",),
+    "realitycapture": ("registration.csv",),
+    "xmp": ("IMG_02.xmp",),
+    "opensfm": ("opensfm/reconstruction.json",),
+    "meshroom": ("MeshroomCache/StructureFromMotion/0a1b/cameras.sfm",),
+    "bundler": ("bundle.out", "list.txt"),
+    "scannetpp": ("dslr/nerfstudio/transforms_undistorted.json",),
+    "arkitscenes": ("lowres_wide.traj", "lowres_wide_intrinsics/41069021_305.377.pincam"),
 }
 CASES = [(layout, name) for layout, names in FILES.items() for name in names]
 

@@ -19,7 +19,7 @@ from fieldfuse.capture.storage import capture_from_dict, capture_to_dict
 from fieldfuse.config import CaptureSettings
 from fieldfuse.errors import InputError
 from tests.capture.layouts import PHONE, quarter_size, write_polycam, write_record3d, zipped
-from tests.capture.made import Pinhole, eyes, pixel_error, render
+from tests.capture.made import Pinhole, eyes, pixel_error, render, save_picture
 
 codecs = pytest.importorskip("imagecodecs", reason="imagecodecs is not installed; make test brings it")
 
@@ -150,6 +150,31 @@ def test_chosen_frames_are_the_files_of_the_recording(recording: Path, tmp_path:
     fewer = select_frames(capture, tmp_path / "run", CaptureSettings(max_frames=2))
     left = sorted(path.stem for path in (tmp_path / "run" / "frames").rglob("frame_*"))
     assert left == sorted([frame.name for frame in fewer.frames] + [frame.name for frame in fewer.frames if frame.depth is not None])
+
+
+@pytest.mark.parametrize("suffix", ["jpg", "png"])
+def test_what_is_exported_as_exr_and_rgb(made: Path, tmp_path: Path, suffix: str) -> None:
+    from tests.capture.test_exr import write_exr  # skips where OpenEXR is not installed
+
+    root = tmp_path / "scan/EXR_RGBD"
+    (root / "depth").mkdir(parents=True)
+    for number, eye in enumerate(eyes()):
+        save_picture(root / f"rgb/{number}.{suffix}", render(eye, PHONE)[0])
+        depth = render(eye, quarter_size(PHONE))[1].astype(np.float32)
+        write_exr(root / f"depth/{number}.exr", {"R": np.where(depth > 0, depth, np.nan)})
+    shutil.copy(made / "metadata", root / "metadata.json")
+    capture = open_capture(tmp_path / "scan")
+    assert (capture.kind, capture.film, capture.metric) == ("record3d", True, True)
+    assert pixel_error(capture, eyes(), PHONE) < 1e-3
+    chosen = select_frames(capture, tmp_path / "run", CaptureSettings(max_frames=10))
+    for frame, eye in zip(chosen.frames, eyes(), strict=True):
+        assert frame.image.read_bytes().startswith(b"\xff\xd8"), "JPEG, whatever it was"
+        np.testing.assert_allclose(load_depth(frame, chosen), render(eye, quarter_size(PHONE))[1], rtol=1e-6)
+    (root / "rgb/0.jpg").unlink(missing_ok=True)
+    for file in (root / "rgb").iterdir():
+        file.rename(file.with_name(f"a{file.name}"))
+    with pytest.raises(InputError, match="whose names are numbers"):
+        open_capture(root)
 
 
 # ------------------------------------------------------------------------------------------------ what is refused

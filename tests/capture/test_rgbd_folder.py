@@ -131,6 +131,35 @@ def test_the_unit_of_depth_is_found_by_the_poses(tmp_path: Path) -> None:
     assert any("5000 for each unit of the poses is taken, which fits the poses" in one for one in open_capture(tmp_path / "five").warnings)
 
 
+def test_folders_as_deep_video_mvs_has_them(tmp_path: Path) -> None:
+    write(tmp_path, 1000.0, "images/{:05d}.png", "depth/{:05d}.png")
+    np.savetxt(tmp_path / "poses.txt", np.array(poses()).reshape(5, 16))
+    np.savetxt(tmp_path / "K.txt", np.array([[FX, 0, CX], [0, FY, CY], [0, 0, 1]]))
+    agrees(tmp_path, 1000)
+
+
+@pytest.mark.parametrize(("camera", "scale"), [({"width": 80, "height": 60, "depth_scale": 5000}, 5000), ({}, 1000)])
+def test_without_poses_they_are_to_be_found(tmp_path: Path, camera: dict[str, float], scale: float) -> None:
+    """Folders as cameras of Intel and Microsoft are recorded into."""
+    write(tmp_path, scale, "rgb/{:05d}.png", "depth/{:05d}.png")
+    (tmp_path / "camera_intrinsics.json").write_text(json.dumps({**camera, "fx": FX, "fy": FY, "cx": CX, "cy": CY}))
+    capture = open_capture(tmp_path)
+    assert capture.kind == "rgbd" and not capture.posed and capture.metric and capture.has_depth
+    assert "there is no list of poses, and they are found from the images" in capture.warnings[0]
+    np.testing.assert_allclose(load_depth(capture.frames[0], capture), render(eyes()[0], K)[1], atol=2e-3)
+
+
+def test_without_a_camera_it_is_asked_for_by_name(tmp_path: Path) -> None:
+    write(tmp_path, 1000.0, "rgb/{:05d}.png", "depth/{:05d}.png")
+    capture = open_capture(tmp_path)
+    assert capture.kind == "photos"
+    wanted = 'write them to intrinsics.json ({"width": 80, "height": 60, "fx": …'
+    assert any(wanted in one and "depth maps in depth/ are not used" in one for one in capture.warnings)
+    for file in (tmp_path / "depth").iterdir():
+        cv2.imwrite(str(file), np.full((60, 80), 99, np.uint8))
+    assert not any("are not used" in one for one in open_capture(tmp_path).warnings), "pictures of depth are none"
+
+
 def test_what_does_not_belong_together_is_said_in_one_sentence(tmp_path: Path) -> None:
     write(tmp_path)
     (tmp_path / "poses.txt").write_text(POSES["no time"][1]())

@@ -7,12 +7,13 @@ from pathlib import Path
 
 import cv2
 import numpy as np
+import pycolmap
 import pytest
 
 from fieldfuse.camera import EQUIRECTANGULAR, FISHEYE, PINHOLE, Array, Intrinsics, directions_of, pixel_grid, project, seen_at
 from fieldfuse.capture.images import load_depth, load_image, load_mask
 from fieldfuse.capture.prepare import held_out, limited
-from fieldfuse.capture.sphere import View, announced, cut_images, cut_view, share_of_pinhole, to_cut, views_of
+from fieldfuse.capture.sphere import View, announced, cut_images, cut_view, image_circles, share_of_pinhole, to_cut, views_of
 from fieldfuse.capture.storage import capture_from_dict, capture_to_dict
 from fieldfuse.capture.types import CUT, Capture, Frame
 from tests.capture.spheres import room, walk
@@ -39,6 +40,19 @@ def test_directions_lie_in_a_panorama_by_longitude_and_latitude(direction: tuple
     np.testing.assert_allclose(found, pixel, atol=1e-9)
     assert seen
     assert seen_at(PANORAMA, np.array([0.0, -1.0, 0.0]))[0][1] == 0  # straight up: the first row
+
+
+@pytest.mark.parametrize(
+    ("model", "own"),
+    [("EQUIRECTANGULAR", PANORAMA), ("OPENCV_FISHEYE", Intrinsics(800, 400, 250.0, 260.0, 410.0, 190.0, FISHEYE, (0.03, -0.01, 0.0, 0.0)))],
+)
+def test_colmap_puts_directions_where_we_do(model: str, own: Intrinsics) -> None:
+    theirs = pycolmap.Camera.create_from_model_name(0, model, 250.0, 800, 400)
+    if own.lens == FISHEYE:
+        theirs.params = [own.fx, own.fy, own.cx, own.cy, *own.distortion]
+    rays = np.random.default_rng(2).normal(size=(200, 3)) * [1, 1, 1.0 if own.lens == EQUIRECTANGULAR else 0] + [0, 0, 0.7]
+    for ray, pixel in zip(rays, seen_at(own, rays)[0], strict=True):
+        np.testing.assert_allclose(theirs.img_from_cam(ray), pixel, atol=1e-6)
 
 
 def test_a_fisheye_lens_is_opencvs_and_shows_what_lies_beside_the_camera() -> None:
@@ -166,6 +180,21 @@ def test_a_posed_fisheye_capture_becomes_posed_views_with_masks_and_depth(tmp_pa
         along = directions_of(frame.intrinsics, pixel_grid(frame.intrinsics.width, frame.intrinsics.height))[:, 2].reshape(distance.shape)
         there = depth > 0
         assert there.mean() > 0.5 and np.median(np.abs(depth[there] / (distance * along)[there] - 1)) < 0.01
+
+
+def test_what_lies_outside_a_fisheye_lenses_image_circle_is_masked_out(tmp_path: Path) -> None:
+    camera = fisheye(200, 240, 240)
+    capture = captured(tmp_path, camera, count=3)
+    radius = np.hypot(*np.mgrid[-119.5:120, -119.5:120])
+    for frame in capture.frames:
+        image = cv2.imread(str(frame.image))
+        image[radius > 110] = 0  # 183°
+        image[100:110, 100:110] = 0  # black, but not outside
+        cv2.imwrite(str(frame.image), image)
+    (circle,) = image_circles(capture.frames, False).values()
+    assert circle.mean() == pytest.approx(np.pi * 108**2 / 240**2, rel=0.03) and circle[110, 110]
+    for frame in cut_images(capture, tmp_path / "run", 1).frames:
+        assert (load_image(frame)[load_mask(frame)].max(axis=1) > 5).mean() > 0.97
 
 
 def test_views_are_written_once_and_again_where_their_image_changed(tmp_path: Path) -> None:

@@ -156,6 +156,27 @@ def test_nothing_is_left_behind_and_errors_name_the_zip_file(tmp_path: Path, mon
     assert not (tmp_path / "out").exists() and not list((tmp_path / "temporary").iterdir())
 
 
+def test_whatever_bytes_change_nothing_is_written_elsewhere(tmp_path: Path) -> None:
+    """Changed bytes are refused in a sentence, or unpack to files inside; where the archive is and nothing else."""
+    place = tmp_path / "a" / "b" / "c"
+    place.mkdir(parents=True)
+    archive = zip_of(place / "a.zip", scan__images__1=b"x" * 400, scan__images__2=bytes(range(200)), scan__3=b"1")
+    whole, random, refused = archive.read_bytes(), np.random.default_rng(3), 0
+    for _ in range(200):
+        data = bytearray(whole)
+        for at in random.integers(0, len(data), random.integers(1, 9)):
+            data[at] = random.choice([*b"\0\xff./\\:", int(random.integers(256))])
+        archive.write_bytes(data)
+        try:
+            unpack(archive, place / "out")
+        except InputError as error:
+            assert len(str(error).splitlines()) == 1
+            refused += 1
+        assert {path.name for path in place.iterdir()} <= {"a.zip", "out"}
+        assert [path.name for path in (tmp_path, tmp_path / "a", tmp_path / "a" / "b") for path in path.iterdir()] == ["a", "b", "c"]
+    assert refused > 100
+
+
 # ------------------------------------------------------------------------------------------------ the command line
 
 

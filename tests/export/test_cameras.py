@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from dataclasses import replace
 from pathlib import Path
 
 import cv2
@@ -17,8 +18,8 @@ from fieldfuse.camera import Intrinsics, project
 from fieldfuse.capture import open_capture
 from fieldfuse.errors import InputError
 from fieldfuse.export.cameras import colmap_model, quaternion, write_cameras
-from fieldfuse.pipelines.exports import sparse_points
-from tests.export.samples import cameras, turned
+from fieldfuse.export.sparse import stored_points
+from tests.export.samples import cameras
 
 POINTS = np.random.default_rng(2).normal(size=(30, 3))
 
@@ -48,14 +49,9 @@ def test_colmap_projects_where_we_do(tmp_path: Path) -> None:
     assert np.array_equal([model.points3D[i].color for i in sorted(model.points3D)], colours)
 
 
-def test_the_similarity_is_undone_for_poses_and_points(tmp_path: Path) -> None:
+def test_poses_have_opengl_axes_in_the_json(tmp_path: Path) -> None:
     names, intrinsics, poses = cameras()
-    similarity = turned()
-    write_cameras(tmp_path, names, intrinsics, similarity.poses(poses), similarity.points(POINTS), working_from_input=similarity)
-    model = pycolmap.Reconstruction(str(tmp_path / "colmap"))
-    for image, pose in zip((model.images[i] for i in sorted(model.images)), poses, strict=True):
-        assert np.abs(np.asarray(image.cam_from_world().matrix()) - np.linalg.inv(pose)[:3]).max() < 1e-9
-    assert np.abs(np.array([model.points3D[i].xyz for i in sorted(model.points3D)]) - POINTS).max() < 1e-9
+    write_cameras(tmp_path, names, intrinsics, poses, POINTS)
     data = json.loads((tmp_path / "transforms.json").read_text())
     for frame, pose in zip(data["frames"], poses, strict=True):
         matrix = np.array(frame["transform_matrix"])
@@ -89,6 +85,29 @@ def test_transforms_share_intrinsics_where_they_can(tmp_path: Path) -> None:
     assert [frame["w"] for frame in data["frames"]] == [640, 640, 800, 320, 640, 640, 800]
     write_cameras(tmp_path, names, [intrinsics[3]] * 7, poses)
     assert json.loads((tmp_path / "transforms.json").read_text())["camera_model"] == "OPENCV_FISHEYE"
+
+
+def test_a_lens_that_nerfstudio_does_not_know_is_not_called_opencv(tmp_path: Path) -> None:
+    """nerfstudio 1.1.5 takes one model for a file and knows OPENCV with k1, k2, p1, p2 and k3; its k4 is a term of the eighth power."""
+    names, intrinsics, poses = cameras()
+    six = replace(intrinsics[1], distortion=(-0.1, 0.02, 1e-3, -2e-3, 0.004))
+    for lenses, model, others in (
+        ([intrinsics[2]] * 7, "FULL_OPENCV", {None}),
+        ([six] * 7, "OPENCV", {None}),
+        (intrinsics, "FULL_OPENCV", {None, "OPENCV", "OPENCV_FISHEYE"}),
+        ([intrinsics[i % 2] for i in range(7)], "OPENCV", {None}),
+    ):
+        write_cameras(tmp_path, names, lenses, poses)
+        data = json.loads((tmp_path / "transforms.json").read_text())
+        assert data["camera_model"] == model and {frame.get("camera_model") for frame in data["frames"]} == others
+        assert lenses[0] is not six or data["k3"] == 0.004
+
+
+def test_images_keep_their_names_of_the_model(tmp_path: Path) -> None:
+    write_cameras(tmp_path, ["images/a.png"], [Intrinsics(8, 6, 7.0, 7.0, 4.0, 3.0)], np.eye(4)[None], names=["a.png"])
+    model = pycolmap.Reconstruction(str(tmp_path / "colmap"))
+    assert [image.name for image in model.images.values()] == ["a.png"]
+    assert json.loads((tmp_path / "transforms.json").read_text())["frames"][0]["file_path"] == "images/a.png"
 
 
 @pytest.mark.parametrize("kind", ["shared", "mixed"])
@@ -139,8 +158,8 @@ def test_points_go_with_the_cameras_as_other_programs_look_for_them(tmp_path: Pa
     cloud = trimesh.load(tmp_path / data["ply_file_path"], process=False)
     np.testing.assert_allclose(cloud.vertices, POINTS, atol=1e-5)
     assert np.array_equal(np.asarray(cloud.colors)[:, :3], colours)
-    chosen, shades = sparse_points(tmp_path / data["ply_file_path"])
-    assert chosen is not None and shades is not None and len(chosen) == len(POINTS) and np.array_equal(shades, colours)
+    stored = stored_points(tmp_path / data["ply_file_path"])
+    assert stored is not None and len(stored[0]) == len(POINTS) and np.array_equal(stored[1], colours)
     write_cameras(tmp_path, ["a.png"], [Intrinsics(8, 6, 7.0, 7.0, 4.0, 3.0)], np.eye(4)[None])
     assert "ply_file_path" not in json.loads((tmp_path / "transforms.json").read_text())
-    assert not (tmp_path / "points3D.ply").exists() and sparse_points(tmp_path / "points3D.ply") == (None, None)
+    assert not (tmp_path / "points3D.ply").exists() and stored_points(tmp_path / "points3D.ply") is None

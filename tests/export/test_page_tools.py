@@ -215,3 +215,43 @@ def test_a_path_is_what_render_reads(open_page: Driven, tmp_path: Path) -> None:
     until(lambda: not np.allclose(open_page.run(LOOK), stands))
     open_page.run("document.getElementById('play').click()")
     assert not open_page.errors
+
+
+HEADSET = """
+const at = x => new Float32Array([1, 0, 0, 0, 0, 1, 0, 0, 0, 0, 1, 0, x, 0, 0, 1]);
+const lens = new Float32Array([1.5, 0, 0, 0, 0, 2, 0, 0, 0.1, -0.2, -1, -1, 0, 0, -0.2, 0]);
+const eyes = {views: [-0.03, 0.03].map(x => ({transform: {matrix: at(x)}, projectionMatrix: lens}))};
+window.XRWebGLLayer = class {
+  framebuffer = null;
+  getViewport(eye) { return {x: eye === eyes.views[0] ? 0 : 40, y: 0, width: 40, height: 30}; }
+};
+const session = {
+  updateRenderState: async () => {}, requestReferenceSpace: async () => ({}), frames: 0,
+  requestAnimationFrame(draw) {
+    if (this.frames++ < 2) setTimeout(draw, 0, 0, {getViewerPose: () => eyes});
+    else setTimeout(() => this.onend(), 0);
+  },
+};
+const xr = {isSessionSupported: async kind => kind === 'immersive-vr', requestSession: async () => session};
+Object.defineProperty(navigator, 'xr', {value: xr});
+WebGL2RenderingContext.prototype.makeXRCompatible = async () => {};
+"""
+
+
+def test_a_headset_gets_a_picture_an_eye(open_page: Driven, page: Path) -> None:
+    """With a stand-in for WebXR: two eyes 6 cm apart, level, in the direction in which the visitor looked."""
+    assert open_page.run("document.getElementById('vr').hidden")
+    added = open_page.ask("Page.addScriptToEvaluateOnNewDocument", source=HEADSET)["identifier"]
+    opened(open_page, page, *WINDOW)
+    open_page.ask("Page.removeScriptToEvaluateOnNewDocument", identifier=added)
+    open_page.run("window.drawn = [], fieldfuse.plain = fieldfuse.draw")
+    open_page.run("fieldfuse.draw = (...given) => { given[3] && drawn.push([given[0].width, given[3]]); fieldfuse.plain(...given); }")
+    _, right, _, forward = standing(open_page)
+    open_page.run("document.getElementById('vr').click()")
+    until(lambda: open_page.run("drawn.length === 4 && !fieldfuse.away"))
+    (width, left), (_, other) = open_page.run("drawn.slice(2)")
+    assert np.allclose(np.subtract(other["place"], left["place"]), 0.06 * FRAME.scale * right, atol=1e-6)
+    level = forward * [1, 1, 0] / np.linalg.norm(forward[:2])
+    assert np.allclose(np.reshape(left["turn"], (3, 3)), [right, [0, 0, -1], level], atol=1e-6)
+    assert left["lens"][0] == pytest.approx(0.75 * width) and left["lens"][2] == pytest.approx(0.45 * width)
+    assert not open_page.errors

@@ -11,6 +11,7 @@ from fieldfuse.camera import Array, Intrinsics
 from fieldfuse.errors import InputError
 from fieldfuse.export.mesh import mesh_facts
 from fieldfuse.export.surface import Refinement, field_volume, reliable_depth
+from fieldfuse.poses.region import Region
 from fieldfuse.render.image import Rendered
 from tests.tsdf.scenes import CAMERA, all_round, sphere_colour, sphere_depth, sphere_frame
 
@@ -82,7 +83,7 @@ def test_what_is_rendered_may_be_smaller_than_its_depth_map() -> None:
 
 
 def test_the_region_is_kept_and_the_rest_is_not() -> None:
-    region = (CENTRE - 1.0, CENTRE + np.array([1, 1, 0]))  # the lower half
+    region = Region.box(CENTRE - 1.0, CENTRE + np.array([1, 1, 0]))  # the lower half
     mesh = field_volume(exact, POSES, CAMERAS, 0.02, region=region).mesh()
     assert mesh.vertices[:, 2].max() < CENTRE[2] + 0.03
     assert mesh.vertices[:, 2].min() < CENTRE[2] - RADIUS + 0.03

@@ -7,7 +7,9 @@ import os
 import shutil
 from pathlib import Path
 
+import numpy as np
 import pytest
+import trimesh
 
 from fieldfuse.files import read_json
 from fieldfuse.pipelines.console import make_progress
@@ -164,3 +166,48 @@ def test_what_could_not_be_made_without_the_capture_is_made_when_it_is_back(out:
     away.rename(room)
     assert call(capsys, "export", out, *AGAIN).code == 0
     assert files(out) >= {"cameras", "mesh.glb"}
+
+
+def test_cameras_come_with_points_and_pinhole_images_with_both(out: Path, capsys: Capsys) -> None:
+    (out / "exports" / "points.ply").unlink()
+    answer = call(capsys, "export", out, "--formats", "cameras", "--undistorted", *AGAIN)
+    assert answer.code == 0 and files(out) == {"cameras", "undistorted"}, answer.err
+    folder = out / "exports" / "undistorted"
+    for lines in ((out / "exports" / "cameras" / "colmap" / "points3D.txt"), folder / "sparse" / "0" / "points3D.txt"):
+        assert len(lines.read_text().splitlines()) > 50
+    data = read_json(folder / "transforms.json")
+    assert {entry["file_path"] for entry in data["frames"]} == {f"images/{path.name}" for path in (folder / "images").iterdir()}
+    assert len(data["frames"]) == 10 and len(data["test_filenames"]) == 2
+    shutil.rmtree(out.parent / "room")
+    answer = call(capsys, "export", out, "--undistorted", *AGAIN)
+    assert answer.code == 2 and "undistorted images were left out" in answer.sentence()
+
+
+def test_a_crop_holds_for_all_that_is_exported(out: Path, capsys: Capsys) -> None:
+    cloud = trimesh.load(out / "exports" / "points.ply", process=False)
+    low, high = cloud.vertices.min(axis=0), cloud.vertices.max(axis=0)
+    box = [*low, *(0.5 * low + 0.5 * high)]
+    numbers = ",".join(f"{value:.6f}" for value in box)
+    answer = call(capsys, "export", out, "--formats", "points,ply", "--crop", numbers, *AGAIN)
+    assert answer.code == 0, answer.err
+    warnings = json.loads(answer.out)["warnings"]
+    assert any("exports are cropped" in text for text in warnings)
+    assert any("another crop, and removed" in text and "transforms.json" in text for text in warnings)
+    assert files(out) == {"points.ply", "mesh.ply", "cameras"} and not (out / "exports" / "cameras" / "transforms.json").exists()
+    size = np.ptp(np.asarray(cloud.vertices), axis=0).max()
+    for name in ("points.ply", "mesh.ply"):
+        part = trimesh.load(out / "exports" / name, process=False)
+        assert len(part.vertices) > 10
+        assert (part.vertices >= low - 0.1 * size).all() and (part.vertices <= box[3:] + 0.1 * size).all()
+    # The next export has the same part, and --crop off all of it.
+    assert read_json(out / "run.json")["settings"]["export"]["crop"] == numbers
+    answer = call(capsys, "export", out, "--formats", "glb", *AGAIN)
+    assert answer.code == 0 and {"points.ply", "mesh.glb"} <= files(out)
+    assert call(capsys, "export", out, "--formats", "points", "--crop", "off", *AGAIN).code == 0
+    assert files(out) == {"points.ply", "cameras"}
+    again = trimesh.load(out / "exports" / "points.ply", process=False)
+    assert np.allclose(again.vertices.max(axis=0), high)
+    answer = call(capsys, "export", out, "--crop", "9000,9000,9000,9001,9001,9001", *AGAIN)
+    assert answer.code == 2 and "nothing of the field lies in the region" in answer.sentence()
+    answer = call(capsys, "export", out, "--crop", "bix", *AGAIN)
+    assert answer.code == 2 and "did you mean" not in answer.sentence() and "x0,y0,z0,x1,y1,z1" in answer.sentence()

@@ -119,9 +119,10 @@ def test_a_path_of_the_page_is_rendered_as_the_page_shows_it(done: Path, tmp_pat
     with driven((done / "exports" / "field.html").as_uri(), tmp_path, (400, 300)) as browser:
         until(lambda: browser.run("!!window.fieldfuse"))
         start = browser.run("fieldfuse.about.start")
-        test = read_json(done / "report.json")["evaluation"]["field"]["per_view"]
-        assert browser.run(f"fieldfuse.about.photos[{start}].name") not in {view["name"] for view in test}
-        assert browser.run("fieldfuse.tools.unit") == "m"
+        told = read_json(done / "report.json")
+        held_out = {view["name"] for view in told["evaluation"]["field"]["per_view"]}
+        assert browser.run(f"fieldfuse.about.photos[{start}].name") not in held_out
+        assert browser.run("fieldfuse.about.metric") == told["scene"]["metric"]
         for shown in (start, 0):
             browser.run(f"fieldfuse.to({shown})")
             until(lambda: browser.run("!fieldfuse.walker.journey"))

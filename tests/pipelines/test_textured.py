@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import shutil
+import sys
 from pathlib import Path
 
 import cv2
@@ -45,6 +46,28 @@ def test_a_texture_has_texels_of_the_photos(run: Path, tmp_path: Path, capsys: C
     assert call(capsys, "export", out, "--set", "export.texture_size=48", "--formats", "texture", "--quiet").code == 0
     small = trimesh.load(out / "exports" / "textured.glb").to_geometry().visual.material.baseColorTexture.size
     assert large[0] > small[0]
+
+
+def test_formats_of_other_programs_are_made_when_they_are_named(
+    run: Path, tmp_path: Path, capsys: Capsys, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    laspy = pytest.importorskip("laspy", reason="the extra `las` is not installed")
+    out = shutil.copytree(run / "out", tmp_path / "out")
+    monkeypatch.setitem(sys.modules, "pxr", None)
+    answer = call(capsys, "export", out, "--formats", "points,laz,usdz,e57", "--quiet")
+    assert answer.code == 0, answer.err
+    made = {path.name for path in (out / "exports").iterdir()} - {"facts.json"}
+    assert made == {"textured.glb", "points.ply", "points.laz", "points.e57"}
+    cloud, read = trimesh.load(out / "exports" / "points.ply", process=False), laspy.read(out / "exports" / "points.laz")
+    assert np.abs(read.xyz - cloud.vertices).max() < 1e-5 and np.array_equal(np.asarray(read.red) // 257, cloud.colors[:, 0])
+    said_so = " ".join(read_json(out / "report.json")["warnings"])
+    assert 'usdz was left out: the format usdz needs the extra `usd`, which is not installed: pip install "fieldfuse[usd]"' in said_so
+    answer = call(capsys, "export", out, "--formats", "usdz", "--quiet")
+    assert answer.code == 2 and answer.sentence().count("usdz") == 2
+    monkeypatch.delitem(sys.modules, "pxr")
+    pytest.importorskip("pxr", reason="the extra `usd` is not installed")
+    answer = call(capsys, "export", out, "--formats", "usdz", "--quiet")
+    assert answer.code == 0 and (out / "exports" / "textured.usdz").is_file(), answer.err
 
 
 @pytest.mark.parametrize(("side", "expected"), [(1280, 192), (96, 96), (48, None), (20, None)])

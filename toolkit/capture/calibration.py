@@ -25,6 +25,7 @@ JSON_NAMES = (
     "camera_primesense.json",  # of Open3D's samples
 )
 MAX_SIDE = 1_000_000  # pixels
+PANORAMA_SHAPE = 0.01  # by which a panorama's width may differ from twice its height
 CENTRAL = 0.25  # how far twice the principal point of a sensor may lie from its image's size, as a share of that
 
 
@@ -41,6 +42,17 @@ def usable_size(width: float, height: float, where: str) -> tuple[int, int]:
     if not (1 <= width <= MAX_SIDE and 1 <= height <= MAX_SIDE):
         raise InputError(f"{where}: the image size {width:g}×{height:g} is not usable; correct it")
     return round(width), round(height)
+
+
+def panorama(width: int, height: int, where: str) -> Intrinsics:
+    """The camera of a 360° panorama, whose middle looks along its axis.
+
+    Raises:
+        InputError: it is not twice as wide as high.
+    """
+    if abs(width / (2 * height) - 1) > PANORAMA_SHAPE:
+        raise InputError(f"{where}: a 360° panorama is twice as wide as high, this one is {width}×{height}; correct its camera model")
+    return Intrinsics.equirectangular(width, height)
 
 
 def fits_shape(intrinsics: Intrinsics, size: tuple[int, int]) -> bool:

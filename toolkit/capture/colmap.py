@@ -20,7 +20,7 @@ from pathlib import Path
 
 import numpy as np
 
-from fieldfuse.camera import FISHEYE, OPENCV, PINHOLE, Array, Intrinsics, invert
+from fieldfuse.camera import EQUIRECTANGULAR, FISHEYE, OPENCV, PINHOLE, Array, Intrinsics, invert
 from fieldfuse.capture.calibration import fits_shape, fitted, usable_size
 from fieldfuse.capture.headers import image_header
 from fieldfuse.capture.images import spread
@@ -28,7 +28,7 @@ from fieldfuse.capture.listing import assemble, counted, images_in, natural_key,
 from fieldfuse.capture.masks import masks_among
 from fieldfuse.capture.poses import checked_place, rigid
 from fieldfuse.capture.resolve import CaptureFiles, Found
-from fieldfuse.capture.types import Capture, Frame
+from fieldfuse.capture.types import MODEL_NAMES, Capture, Frame
 from fieldfuse.errors import InputError, first_line
 
 USUAL = re.compile(r"((colmap|dense|distorted|undistorted)/(\d+/)?)*sparse(/\d+)?|\.")
@@ -55,7 +55,7 @@ MODELS = (  # by COLMAP's numbers: name, parameters, and our lens, where it has 
     ("SIMPLE_FISHEYE", 3, FISHEYE),
     ("FISHEYE", 4, FISHEYE),
     ("EUCM", 6, None),
-    ("EQUIRECTANGULAR", 2, None),
+    ("EQUIRECTANGULAR", 2, EQUIRECTANGULAR),
 )
 SUPPORTED = {name: (count, lens) for name, count, lens in MODELS if lens is not None}
 ONE_FOCAL = ("SIMPLE_PINHOLE", "SIMPLE_RADIAL", "RADIAL", "SIMPLE_RADIAL_FISHEYE", "RADIAL_FISHEYE", "SIMPLE_FISHEYE")
@@ -174,13 +174,14 @@ def candidate_capture(root: Path, candidate: CandidateModel) -> Capture:
     if not images:
         raise CaptureFiles(_above_model(root)).none_exists(f"the model {candidate.name}", listed, Found([], outside=candidate.outside))
     located, warnings = sorted(images), list(candidate.remarks)
-    frames, scaled = [], 0
+    frames, scaled, names = [], 0, {}
     for index, name in zip(located, unique_names([images[index] for index in located]), strict=True):
         entry = model.images[index]
         described = model.cameras[entry.camera]
         intrinsics = fitted(described, image_header(images[index]).size, f"{entry.name} in {root / candidate.name}", images[index])
         scaled += intrinsics is not described
         frames.append(Frame(name=name, image=images[index], intrinsics=intrinsics, world_from_camera=entry.world_from_camera))
+        names[name] = entry.name
     missing = listed - len(frames)
     if missing:
         warnings.append(f"{missing} of the {listed} images of the model do not exist; the other {len(frames)} are used")
@@ -193,7 +194,7 @@ def candidate_capture(root: Path, candidate: CandidateModel) -> Capture:
         unregistered += len(set(beside) - used - masks_among(beside))
     if unregistered:
         warnings.append(f"{counted(unregistered, 'image')} beside these are not in the model and are left out")
-    extra = {"listed": listed, "missing": missing, "unregistered": unregistered}
+    extra = {"listed": listed, "missing": missing, "unregistered": unregistered, MODEL_NAMES: names}
     return assemble("colmap", root, frames, warnings, points=model.points if len(model.points) else None, extra=extra)
 
 
@@ -241,11 +242,12 @@ def _fit(model: Model, found: Found) -> tuple[int, float]:
 
 
 def _above_model(root: Path) -> Path:
-    """The folder that holds a model's images: above `root` when this is the model's own folder (`sparse/0`, `colmap/sparse`)."""
+    """The folder that holds a model's images: above `root` when this is the model's own folder (`sparse/0`, `colmap/sparse`,
+    `distorted/sparse/1`)."""
     top = root.resolve()
     if top.name.isdecimal() and top.parent.name == "sparse":
         top = top.parent
-    for name in ("sparse", "colmap"):
+    for name in ("sparse", "colmap", "distorted"):
         top = top.parent if top.name == name else top
     return top
 
@@ -284,6 +286,8 @@ def intrinsics_of(model: str, width: int, height: int, values: list[float], wher
     count, kind = SUPPORTED[model]
     if len(values) != count:
         raise InputError(f"{where}: the camera model {model} has {count} parameters, not {len(values)}; check how the file was written")
+    if kind == EQUIRECTANGULAR:  # its parameters are the image's size
+        return Intrinsics.equirectangular(*usable_size(width, height, where))
     fx, fy, cx, cy, *lens = [values[0], *values] if model in ONE_FOCAL else values
     if kind != PINHOLE:
         lens += [0.0] * (4 - len(lens))

@@ -6,11 +6,15 @@ The order is deliberate: what somebody wrote for this very purpose goes before w
 3. RGB-D layouts, whose depth would be lost by reading them as anything else (ScanNet before 7-Scenes: they share file names), those of
    phones with a depth sensor among them;
 4. DTU's `cameras*.npz`;
-5. a COLMAP model before LLFF's `poses_bounds.npy`: sets that have both keep lens and points only in the model, but only
+5. what photogrammetry programs export (Metashape, RealityCapture, OpenSfM and OpenDroneMap, Meshroom, Bundler);
+6. a COLMAP model before LLFF's `poses_bounds.npy`: sets that have both keep lens and points only in the model, but only
    when its images are there (sets at 1/8 size often come without them);
-6. colour and depth in folders of any name, with a list of poses;
-7. photos; 8. one video (or recording in one file) in a folder, alone or with one image (its cover);
-9. the only capture in a folder further down, as unpacking leaves it.
+7. colour and depth in folders of any name, with a list of poses;
+8. photos; 9. one video (or recording in one file) in a folder, alone or with one image (its cover);
+10. the only capture in a folder further down, as unpacking leaves it.
+
+Where several of 1, 2, 5 and 6 lie in one folder, the first is used, unless it cannot be read or another has poses for many more images; the
+others are named.
 """
 
 from __future__ import annotations
@@ -20,21 +24,29 @@ from dataclasses import replace
 from pathlib import Path
 
 from fieldfuse.capture.archive import SUFFIXES as ARCHIVES
+from fieldfuse.capture.arkitscenes import looks_like_arkitscenes, read_arkitscenes
 from fieldfuse.capture.blender import looks_like_blender, read_blender
+from fieldfuse.capture.bundler import looks_like_bundler, read_bundler
 from fieldfuse.capture.colmap import candidate_models, has_images, looks_like_colmap, owners, read_colmap
 from fieldfuse.capture.dtu import looks_like_dtu, read_dtu
-from fieldfuse.capture.listing import IMAGES, images_in, natural_key, require_folder, some_of
+from fieldfuse.capture.listing import IMAGES, counted, images_in, natural_key, require_folder, some_of
 from fieldfuse.capture.llff import looks_like_llff, read_llff
+from fieldfuse.capture.meshroom import ALEMBIC, looks_like_meshroom, read_meshroom, scenes_of
+from fieldfuse.capture.metashape import looks_like_metashape, read_metashape
+from fieldfuse.capture.opensfm import NAME as OPENSFM
+from fieldfuse.capture.opensfm import looks_like_opensfm, read_opensfm
 from fieldfuse.capture.photos import looks_like_photos, photo_files, read_photos
 from fieldfuse.capture.polycam import looks_like_polycam, read_polycam
+from fieldfuse.capture.realitycapture import looks_like_realitycapture, read_realitycapture
 from fieldfuse.capture.record3d import SUFFIX as RECORD3D
 from fieldfuse.capture.record3d import holds_record3d, looks_like_record3d, read_record3d
 from fieldfuse.capture.redwood import looks_like_redwood, read_redwood
 from fieldfuse.capture.replica import looks_like_replica, read_replica
 from fieldfuse.capture.resolve import CaptureFiles
-from fieldfuse.capture.rgbd_folder import looks_like_rgbd, read_rgbd
+from fieldfuse.capture.rgbd_folder import looks_like_rgbd, read_rgbd, unused_depth
 from fieldfuse.capture.scanner3d import looks_like_scanner3d, read_scanner3d
 from fieldfuse.capture.scannet import looks_like_scannet, read_scannet, read_sens
+from fieldfuse.capture.scannetpp import looks_like_scannetpp, read_scannetpp
 from fieldfuse.capture.sens import is_sens
 from fieldfuse.capture.seven_scenes import looks_like_seven_scenes, read_seven_scenes
 from fieldfuse.capture.stray import looks_like_stray, read_stray
@@ -47,6 +59,15 @@ from fieldfuse.files import require_utf8
 
 FILMS = (*VIDEO_SUFFIXES, RECORD3D)
 DEEPEST, MOST_FOLDERS = 3, 200  # where captures are looked for that are not in the given folder itself
+# Kinds without depth, whose files may lie together.
+POSED_IMAGES = ("transforms", "blender", "metashape", "realitycapture", "opensfm", "meshroom", "bundler", "colmap", "llff")
+FEWER = 0.8  # of the images that another has poses for, below which the first of several is not used
+PROJECTS = {
+    (".psx", ".psz"): "a project of Metashape; export its cameras as XML (File › Export › Export Cameras)",
+    (".rsproj", ".rcproj"): 'a project of RealityCapture; export its registration as "Internal/External camera parameters" (CSV)',
+    (".mg",): "a project of Meshroom; give its MeshroomCache, or the cameras.sfm of the node StructureFromMotion",
+    (".abc",): ALEMBIC.removeprefix("is "),
+}
 
 
 def _colmap_without_llff(path: Path) -> bool:
@@ -110,6 +131,11 @@ def _descended(folder: Path, below: Path) -> Capture:
     return replace(capture, warnings=(f"the capture was found in {below.relative_to(folder).as_posix()}/", *capture.warnings))
 
 
+def _photos_of(folder: Path) -> Capture:
+    capture = read_photos(folder)
+    return capture.with_frames(capture.frames, *unused_depth(folder))
+
+
 def _photos_without_film(path: Path) -> bool:
     """One image beside a film is its cover, not a capture; and what lies in other folders may have been made of the film."""
     return len(photo_files(path)) > 1 if images_in(path, FILMS) else looks_like_photos(path)
@@ -118,6 +144,7 @@ def _photos_without_film(path: Path) -> bool:
 READERS: tuple[tuple[str, Callable[[Path], bool], Callable[[Path], Capture]], ...] = (
     ("transforms", looks_like_transforms, read_transforms),
     ("blender", looks_like_blender, read_blender),
+    ("scannetpp", looks_like_scannetpp, read_scannetpp),
     ("tum", looks_like_tum, read_tum),
     ("redwood", looks_like_redwood, read_redwood),
     ("replica", looks_like_replica, read_replica),
@@ -127,7 +154,13 @@ READERS: tuple[tuple[str, Callable[[Path], bool], Callable[[Path], Capture]], ..
     ("polycam", looks_like_polycam, read_polycam),
     ("record3d", looks_like_record3d, read_record3d),
     ("scanner3d", looks_like_scanner3d, read_scanner3d),
+    ("arkitscenes", looks_like_arkitscenes, read_arkitscenes),
     ("dtu", looks_like_dtu, read_dtu),
+    ("metashape", looks_like_metashape, read_metashape),
+    ("realitycapture", looks_like_realitycapture, read_realitycapture),
+    ("opensfm", looks_like_opensfm, read_opensfm),
+    ("meshroom", looks_like_meshroom, read_meshroom),
+    ("bundler", looks_like_bundler, read_bundler),
     ("colmap", _colmap_without_llff, read_colmap),
     ("llff", looks_like_llff, read_llff),
     ("rgbd", looks_like_rgbd, read_rgbd),
@@ -154,6 +187,13 @@ def read_source(path: Path) -> Capture:
 
 def _read_file(path: Path) -> Capture:
     suffix = path.suffix.lower()
+    for suffixes, what in PROJECTS.items():
+        if suffix in suffixes:
+            raise InputError(f"{path} is {what}")
+    exported = {".xml": read_metashape, ".csv": read_realitycapture, ".sfm": read_meshroom, ".out": read_bundler}.get(suffix)
+    exported = read_opensfm if path.name == OPENSFM else exported
+    if exported is not None:
+        return exported(path)
     if suffix == ".json":
         return read_blender(path.parent) if path.name.startswith("transforms_") else read_transforms(path)
     if suffix in IMAGES:
@@ -165,11 +205,38 @@ def _read_file(path: Path) -> Capture:
     return read_sens(path) if is_sens(path) else read_video(path)
 
 
+def _best_of(folder: Path, first: str) -> Capture:
+    """The best of the captures of posed images in a folder, of which `first` is the first in order; the others are named in a warning."""
+    start = [kind for kind, _, _ in READERS].index(first)
+    rest = [(kind, read) for kind, looks_like, read in READERS[start + 1 :] if kind in POSED_IMAGES and looks_like(folder)]
+    if not rest:
+        return READERS[start][2](folder)
+    captures: dict[str, Capture] = {}
+    errors: dict[str, InputError] = {}
+    for kind, read in ((first, READERS[start][2]), *rest):
+        try:
+            captures[kind] = read(folder)
+        except InputError as error:
+            errors[kind] = error
+    if not captures:
+        raise errors[first]
+    most = max(len(capture.frames) for capture in captures.values())
+    best = next(kind for kind, capture in captures.items() if len(capture.frames) >= FEWER * most)
+    others = [f"{kind} ({counted(len(one.frames), 'image')})" for kind, one in captures.items() if kind != best]
+    remarks = [f"the folder also holds poses of {', '.join(others)}; those of {best} are used"] if others else []
+    remarks += [f"the poses of {kind} in the folder cannot be used: {error}" for kind, error in errors.items()]
+    return captures[best].with_frames(captures[best].frames, *remarks)
+
+
 def _read_folder(folder: Path) -> Capture:
     try:
         for kind, looks_like, read in READERS:
             if looks_like(folder):
-                return (_posed_below(folder) if kind == "photos" else None) or read(folder)
+                if kind in POSED_IMAGES:
+                    return _best_of(folder, kind)
+                if kind == "photos":
+                    return _posed_below(folder) or _photos_of(folder)
+                return read(folder)
         videos = images_in(folder, FILMS)
     except OSError as error:
         raise InputError(f"cannot read {error.filename or folder}: {error.strerror or error}") from error
@@ -182,6 +249,8 @@ def _read_folder(folder: Path) -> Capture:
     below = _read_below(folder)
     if below is not None:
         return below
+    if alembic := scenes_of(folder, ".abc"):
+        raise InputError(f"{alembic[0]} {ALEMBIC}")
     held = ", ".join(sorted(child.name for child in folder.iterdir())[:4])
     raise InputError(
         f"{folder} holds no capture of a known kind (it holds {held}); "

@@ -81,7 +81,9 @@ class Film:
             for number in sorted(numbers):
                 image = self.known[number].image
                 data = read_bytes(image)
-                read_header(data, image)
+                if read_header(data, image).format not in ("JPEG", "MPO"):
+                    rgb = load_image(self.known[number])[:, :, :3]
+                    data = _encoded(".jpg", cv2.cvtColor(rgb, cv2.COLOR_RGB2BGR), str(image), [cv2.IMWRITE_JPEG_QUALITY, QUALITY])
                 yield number, data
         elif self.packed and scan(self.path).codings[0] == JPEG:
             for number in sorted(numbers):

@@ -16,6 +16,7 @@ import numpy as np
 from PIL import Image
 
 from fieldfuse.camera import Array
+from fieldfuse.capture.heif import file_is_heif, register
 
 GPS_FOLDER = 0x8825
 NORTH_REF, NORTH, EAST_REF, EAST, UP_REF, UP = 1, 2, 3, 4, 5, 6
@@ -31,6 +32,8 @@ def gps_of(path: Path) -> tuple[Array, float | None] | None:
     try:
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")
+            if file_is_heif(path):
+                register(path)
             with Image.open(path) as image:
                 tags = dict(image.getexif().get_ifd(GPS_FOLDER))
                 xmp = image.info.get("xmp") if tags else None

@@ -13,7 +13,7 @@ import cv2
 import numpy as np
 
 from fieldfuse.camera import FISHEYE, OPENCV, PINHOLE, Array, Intrinsics, unproject, world_from_opengl
-from fieldfuse.capture.calibration import fitted, usable_size
+from fieldfuse.capture.calibration import fitted, panorama, usable_size
 from fieldfuse.capture.headers import UNREADABLE, image_header
 from fieldfuse.capture.images import read_image, spread
 from fieldfuse.capture.listing import counted, number
@@ -27,7 +27,6 @@ STEREO = ("VR180_L", "VR180_R", "OMNIDIRECTIONALSTEREO_L", "OMNIDIRECTIONALSTERE
 # nerfstudio and instant-ngp apply coefficients of pinhole cameras too, so a file that has some was made for that.
 FISHEYES = ("OPENCV_FISHEYE", "FISHEYE")
 MODELS = ("OPENCV", "SIMPLE_RADIAL", "RADIAL", "FULL_OPENCV", "PERSPECTIVE", "PINHOLE", "SIMPLE_PINHOLE", *FISHEYES)
-PANORAMA_SHAPE = 0.01  # by which a panorama's width may differ from twice its height
 SAME_FACTOR = 0.1  # how far a principal point may lie from a larger image's centre to be taken for it
 SQUARE = 1.15  # ratio of the focal lengths up to which pixels are nearly square
 FOCALS = (0.1, 50.0)  # of an image's longer side: focal lengths that cameras have
@@ -177,9 +176,7 @@ def _camera(shared: Mapping[str, Any], entry: Mapping[str, Any], size: tuple[int
     width, height = usable_size(value("w") or size[0], value("h") or size[1], where)
     name = entry.get("camera_model", shared.get("camera_model"))
     if str(name).upper() in PANORAMAS:  # as in nerfstudio: the middle looks along the camera's axis; focal lengths mean nothing
-        if abs(width / (2 * height) - 1) > PANORAMA_SHAPE:
-            raise InputError(f"{where}: a 360° panorama is twice as wide as high, this one is {width}×{height}; correct its camera model")
-        return Intrinsics.equirectangular(width, height), flags
+        return panorama(width, height, where), flags
     fx, fy, cx, cy = value("fl_x"), value("fl_y"), value("cx"), value("cy")
     if fx is None and fy is None and (other := _other_keys(value, width, height)) is not None:
         fx, fy, cx, cy = other

@@ -31,14 +31,18 @@ from fieldfuse.files import require_utf8
 
 FOLDERS = (".", "images", "input")
 DEEP, MOST_FILES = 3, 100_000
-OWN_CAPTURE = re.compile(r"transforms.*\.json|poses_bounds\.npy|cameras.*\.npz|sparse|colmap|run\.json|groundtruth\.txt|.*\.(sens|r3d)")
+OWN_CAPTURE = re.compile(
+    r"transforms.*\.json|poses_bounds\.npy|cameras.*\.(npz|xml|txt|bin)|sparse|colmap|run\.json|groundtruth\.txt|reconstruction\.json"
+    r"|bundle\.out|.*\.(sens|r3d|sfm|traj)"
+)
 NO_PHOTOS = {
     *("depth", "depths", "disparity", "normal", "normals", "confidence", "flow", "segmentation", "segmentations", "semantic", "labels"),
     *("thumb", "thumbs", "thumbnail", "thumbnails", "preview", "previews", "render", "renders", "results", "output", "outputs"),
 }
 SMALLER = re.compile(r".*_(2|4|8|16|32)")  # the same photos made smaller, as in images_4
 POSE_FILES = re.compile(
-    r"transforms.*\.json|cameras.*\.(npz|json|xml)|poses_bounds.*\.npy|.*\.(nvm|out|abc|psz)|traj(ectory)?\.(txt|log)|groundtruth\.txt",
+    r"transforms.*\.json|cameras.*\.(npz|json|xml)|poses_bounds.*\.npy|.*\.(nvm|out|abc|psz|sfm)|traj(ectory)?\.(txt|log)|groundtruth\.txt"
+    r"|reconstruction\.json",
     re.IGNORECASE,
 )
 # Kinds whose readers take none of these lists of poses but their own; the others may take any.
@@ -48,6 +52,11 @@ OWN_POSES = {
     "blender": r"transforms_.*\.json",
     "llff": r"poses_bounds\.npy",
     "dtu": r"cameras.*\.npz",
+    "metashape": r"cameras.*\.xml",
+    "realitycapture": "$",
+    "opensfm": r"reconstruction\.json|cameras\.json",
+    "meshroom": r".*\.sfm",
+    "bundler": r".*\.out",
 }
 UNPOSED = "beside these are not in the model and are left out"  # how the remark on them ends
 FILM_DIAGONAL = math.hypot(36.0, 24.0)  # mm

@@ -71,7 +71,8 @@ def ply_columns(content: bytes, wanted: Callable[[list[str]], list[str]], most: 
         raise ValueError(f"{count} vertices; at most {most} can be read")
     if order == "ascii":
         lines = content[start:].decode("ascii", errors="replace").split("\n", count)[:count]
-        points: Array = np.array([[float(words[i]) for i in indices] for words in map(str.split, lines)], dtype=kind).reshape(-1, len(indices))
+        numbers = [[float(words[i]) for i in indices] for words in map(str.split, lines)]
+        points: Array = np.array(numbers, dtype=kind).reshape(-1, len(indices))
     else:
         layout = np.dtype(columns)
         rows = np.frombuffer(content, dtype=layout, count=min(count, (len(content) - start) // layout.itemsize), offset=start)

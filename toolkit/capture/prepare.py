@@ -21,6 +21,7 @@ from fieldfuse.progress import SILENT, Progress
 
 DEFAULT_LONG_SIDE = 640
 WHITE = (1.0, 1.0, 1.0)
+LARGEST_SIDE = 2**30  # of images that stay as large as they were taken
 _MAX_SAMPLES = 4  # samples a pixel and side taken through the lens; what shrinks more is averaged down to this first
 
 
@@ -130,6 +131,27 @@ def images_at(capture: Capture, indices: Iterable[int], long_side: int) -> Itera
         source, colour, _ = _loaded(frame, frame.intrinsics, capture, exif)
         target, image, _ = shrink(source, colour)
         yield target, image
+
+
+def undistorted(capture: Capture) -> Iterator[tuple[Intrinsics, Array, Array]]:
+    """For each frame of a posed capture, as large as it was taken: the pinhole camera, the image (H, W, 3) uint8, or (H, W, 4) where the
+    capture has alpha, and (H, W) bool which pixels show the scene and are not masked out. One frame is decoded at a time.
+
+    Raises:
+        InputError: a frame without intrinsics, or a file that cannot be read.
+    """
+    shrink, exif = _Shrinker(LARGEST_SIDE), turns_by_exif(capture)
+    for frame in capture.frames:
+        if frame.intrinsics is None:
+            raise InputError(f"the frame {frame.name} of {capture.root} has no intrinsics; find poses first")
+        source, colour, alpha = _loaded(frame, frame.intrinsics, capture, exif)
+        target, image, seen = shrink(source, colour)
+        if alpha is not None:
+            opaque = np.where(seen, shrink(source, alpha)[1], 0).astype(np.uint8)
+            share = np.maximum(opaque, 1)[:, :, None].astype(np.float32) / 255
+            image = np.clip((image - 255 * (1 - share)) / share, 0, 255).round().astype(np.uint8)  # without the white behind it
+            image = np.dstack([image, opaque])
+        yield target, image, seen & _usable(frame, source, target, exif)
 
 
 def _loaded(frame: Frame, camera: Intrinsics, capture: Capture, exif: bool) -> tuple[Intrinsics, Array, Array | None]:

@@ -5,6 +5,8 @@ cx, cy of each frame, in newer recordings), `poses` (qx, qy, qz, qw, x, y, z of 
 `dw` and `dh` of the depth (in newer recordings), `fps`. Frame i is `rgbd/i.jpg` with `rgbd/i.depth` (LZFSE, float32, metres along z, row
 by row) and `rgbd/i.conf` (LZFSE, uint8, 0 to 2). Depth shows what the image shows, in fewer pixels: 256×192 of LiDAR.
 
+The export "EXR + RGB" has the same as `metadata.json`, `rgb/i.jpg` (or `.png`) and `depth/i.exr` (metres along z) in a folder `EXR_RGBD`.
+
 Images, depth, `K` and poses go together as they are stored: recordings held upright have upright ones, and so have those that were
 held lying until version 1.10.1 of the app.
 
@@ -28,7 +30,7 @@ import numpy as np
 from fieldfuse.camera import Array, Intrinsics, world_from_opengl
 from fieldfuse.capture.archive import MAP_PIXELS, count_pixels, members, read_bytes, read_member, require_lzfse
 from fieldfuse.capture.calibration import MAX_SIDE, fitted, from_matrix
-from fieldfuse.capture.headers import read_header
+from fieldfuse.capture.headers import image_header, read_header
 from fieldfuse.capture.listing import assemble, counted, files_in, images_in, is_file, number, numbers, read_object
 from fieldfuse.capture.poses import checked_pose, rigid
 from fieldfuse.capture.types import Capture, Frame
@@ -37,6 +39,8 @@ from fieldfuse.files import MAX_JSON_BYTES
 
 SUFFIX = ".r3d"
 METADATA, FRAMES = "metadata", "rgbd"
+EXPORT, EXPORTED, EXPORTED_IMAGES, EXPORTED_DEPTH = "EXR_RGBD", "metadata.json", "rgb", "depth"
+NUMBER = re.compile(r"[0-9]{1,9}")
 MEMBER = re.compile(r"(?P<folder>(?:[^/]+/)*)rgbd/(?P<number>[0-9]{1,9})\.(?P<kind>jpg|depth|conf)")
 TRIED = 20  # images of which one has to be readable, so that their size is known: the app leaves damaged ones behind at times
 FAR = 0.1  # of a side: stabilisers move a principal point by less, and that of an image that lies the other way is farther off
@@ -62,9 +66,25 @@ class _Contents:
                 kinds[member["kind"]][int(member["number"])] = file
         return cls(metadata, kinds["jpg"], kinds["depth"], kinds["conf"])
 
+    @classmethod
+    def exported(cls, folder: Path) -> _Contents:
+        """Of the export "EXR + RGB"."""
+
+        def numbered(files: list[Path]) -> dict[int, Path]:
+            return {int(file.stem): file for file in files if NUMBER.fullmatch(file.stem)}
+
+        images, maps = images_in(folder / EXPORTED_IMAGES, (".jpg", ".jpeg", ".png")), images_in(folder / EXPORTED_DEPTH, (".exr",))
+        return cls(folder / EXPORTED, numbered(images), numbered(maps), {})
+
+
+def _export_of(path: Path) -> Path | None:
+    """The folder of an export "EXR + RGB": `path`, or the one in it."""
+    found = (folder for folder in (path, path / EXPORT) if is_file(folder / EXPORTED))
+    return next((one for one in found if images_in(one / EXPORTED_IMAGES) and images_in(one / EXPORTED_DEPTH, (".exr",))), None)
+
 
 def looks_like_record3d(path: Path) -> bool:
-    return is_file(path / METADATA) and bool(images_in(path / FRAMES, (".jpg",)))
+    return (is_file(path / METADATA) and bool(images_in(path / FRAMES, (".jpg",)))) or _export_of(path) is not None
 
 
 def holds_record3d(archive: Path) -> bool:
@@ -79,7 +99,9 @@ def read_record3d(path: Path | str) -> Capture:
         InputError: it cannot be read, or its `metadata` is not usable; or there is depth, and nothing reads it.
     """
     path = Path(path).absolute()
-    if path.is_dir():
+    if path.is_dir() and (export := _export_of(path)) is not None:
+        found = _Contents.exported(export)
+    elif path.is_dir():
         files = [file for kind in ("jpg", "depth", "conf") for file in files_in(path / FRAMES, f"*.{kind}")]
         found = _Contents.of(path / METADATA, ((file, MEMBER.fullmatch(f"{FRAMES}/{file.name}")) for file in files))
     else:
@@ -90,6 +112,8 @@ def read_record3d(path: Path | str) -> Capture:
         of_root = ((path / name, member) for name in names if (member := MEMBER.fullmatch(name)) and member["folder"] == root)
         found = _Contents.of(path / f"{root}{METADATA}", of_root)
     data, where = _metadata(found.metadata), str(found.metadata)
+    if not found.images:
+        raise InputError(f"{path} holds no images whose names are numbers (0.jpg, 1.jpg, …); {AGAIN}")
     poses, shown = _poses(data, where), sorted(found.images)
     # Of a recording that was cut, images may count from where it was.
     places = list(range(len(shown))) if poses is None or len(poses) == len(shown) else shown
@@ -218,6 +242,8 @@ def _depth_size(data: dict[str, Any], maps: list[Path], size: tuple[int, int], w
     """
     if not maps:
         return None
+    if maps[0].suffix == ".exr":
+        return _of_shape(*image_header(maps[0]).size, size, str(maps[0]))
     require_lzfse(maps[0])
     width, height = _side(data, "dw", where), _side(data, "dh", where)
     if width is None or height is None:
@@ -226,7 +252,12 @@ def _depth_size(data: dict[str, Any], maps: list[Path], size: tuple[int, int], w
         width = pixels // max(height, 1)
         if not pixels or width * height != pixels:
             raise InputError(f"{where} does not have the size of the depth ('dw', 'dh'), and it is no smaller image; export it again")
-    if width * height > MAP_PIXELS:
+    return _of_shape(width, height, size, where)
+
+
+def _of_shape(width: int, height: int, size: tuple[int, int], where: str) -> tuple[int, int]:
+    """The size of depth maps as images of `size` lie."""
+    if not 1 <= width * height <= MAP_PIXELS:
         raise InputError(f"{where}: depth of {width}×{height} cannot be; {AGAIN}")
     for across, down in ((width, height), (height, width)):
         if abs(across * size[1] / (down * size[0]) - 1) < SAME_SHAPE:

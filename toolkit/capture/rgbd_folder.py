@@ -4,21 +4,25 @@ Poses are camera-to-world in OpenCV axes: a 4×4 or 3×4 matrix in each row (16 
 `time tx ty tz qx qy qz qw` with or without the time. They belong to images by name, by time, by number, or row by row. The camera is a
 3×3 or 4×4 matrix, `fx fy cx cy`, ORB-SLAM's or OpenCV's yaml, or json. Depth is divided by `DepthMapFactor` (or `depth_scale`) where
 the camera's file has it; floating-point depth is in the poses' unit; else the unit is the one that fits the poses.
+
+Without a list of poses, but with a camera and depth that is no picture of depth (16 bits, or floating-point), poses are found from the
+images.
 """
 
 from __future__ import annotations
 
 import re
-from collections.abc import Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
 
 from fieldfuse.camera import OPENCV, Array, Intrinsics
+from fieldfuse.capture.archive import read_bytes
 from fieldfuse.capture.calibration import fitted, from_matrix, posed_frame, sensor, usable_size
 from fieldfuse.capture.depth_checks import Sample, unit_factor
-from fieldfuse.capture.headers import image_size
+from fieldfuse.capture.headers import image_size, read_header
 from fieldfuse.capture.images import load_depth, spread
 from fieldfuse.capture.listing import (
     IMAGES,
@@ -67,7 +71,7 @@ class _Poses:
 class _Layout:
     colour: Path
     depth: Path
-    poses: _Poses
+    poses: _Poses | None  # None: a camera is there
 
 
 def looks_like_rgbd(path: Path) -> bool:
@@ -78,7 +82,7 @@ def looks_like_rgbd(path: Path) -> bool:
 
 
 def read_rgbd(path: Path | str) -> Capture:
-    """Frames that have a pose; depth where there is some of an image's name, number or time.
+    """Frames that have a pose (all without a list of poses); depth where there is some of an image's name, number or time.
 
     Raises:
         InputError: no such folders, no camera, or names and numbers of poses that do not fit the images.
@@ -89,8 +93,10 @@ def read_rgbd(path: Path | str) -> Capture:
         raise InputError(f"{root} must hold a folder of colour images, one of depth maps (depth/) and a list of poses")
     images = images_in(layout.colour)
     depths = _depths_of(images, images_in(layout.depth, DEPTH_FILES), root)
-    poses = _poses_of(images, layout.poses, root)
     camera, scale, source = _camera(root, layout, image_size(images[0], images))
+    if layout.poses is None:
+        return _unposed(root, layout, images, depths, (camera, scale, source))
+    poses = _poses_of(images, layout.poses, root)
     frames = []
     for index, (image, name) in enumerate(zip(images, unique_names(images), strict=True)):
         if index in poses and np.isfinite(poses[index]).all():
@@ -102,6 +108,38 @@ def read_rgbd(path: Path | str) -> Capture:
         warnings.append(f"{len(images) - len(frames)} of {counted(len(images), 'image')} have no (finite) pose and are not used")
     capture = assemble("rgbd", root, frames, warnings, ordered=True, metric=scale is not None, depth_scale=scale or 1.0, alpha=False)
     return capture if scale is not None else _in_own_unit(capture)
+
+
+def _unposed(
+    root: Path, layout: _Layout, images: Sequence[Path], depths: Mapping[int, Path], found: tuple[Intrinsics, float | None, str]
+) -> Capture:
+    """The capture of a folder without a list of poses; `found`: camera, stored depth values for each metre, and the file that has them."""
+    camera, scale, source = found
+    frames = []
+    for index, (image, name) in enumerate(zip(images, unique_names(images), strict=True)):
+        posed = posed_frame(name, image, camera, np.eye(4), str(image), depths.get(index))
+        frames.append(replace(posed, world_from_camera=None))
+    places = f"{layout.colour.relative_to(root)}/, {layout.depth.relative_to(root)}/ and {source}"
+    remarks = [f"read as RGB-D from {places}; there is no list of poses, and they are found from the images"]
+    capture = assemble("rgbd", root, frames, remarks, metric=True, depth_scale=scale or 1.0, alpha=False)
+    return capture if scale is not None else _in_own_unit(capture)
+
+
+def unused_depth(root: Path) -> list[str]:
+    """A sentence on depth maps of a folder that is read as photos since it has no camera, and on what would make them of use."""
+    try:
+        colour, depth, _ = next(_pairs_of_folders(root), (None, None, None))
+    except OSError:
+        return []
+    if colour is None or depth is None or not _holds_depth(depth):
+        return []
+    width, height = image_size(images_in(colour)[0])
+    file = "intrinsics.json"
+    example = f'{{"width": {width}, "height": {height}, "fx": …, "fy": …, "cx": …, "cy": …}}'
+    return [
+        f"depth maps in {depth.relative_to(root).as_posix()}/ are not used, since no file has the camera's intrinsics (fx, fy, cx, cy in "
+        f'pixels of the images); write them to {file} ({example}, and "depth_scale": stored values for each metre, if not 1000)'
+    ]
 
 
 # ------------------------------------------------------------------------------------------------ what lies where
@@ -117,7 +155,8 @@ def _folders(root: Path) -> list[Path]:
     return out[1:MOST_FOLDERS]
 
 
-def _layout(root: Path) -> _Layout | None:
+def _pairs_of_folders(root: Path) -> Iterator[tuple[Path, Path, list[Path]]]:
+    """Folders of colour images and of depth maps that lie side by side, and all folders there."""
     everything = _folders(root)
     folders = [folder for folder in everything if not is_mask_folder(folder.name)]
     for depth in folders:
@@ -128,10 +167,27 @@ def _layout(root: Path) -> _Layout | None:
             (folder for folder in beside if folder in folders and len(images_in(folder)) > 1),
             key=lambda folder: (not words_of(folder.name) & COLOUR_WORDS, -len(images_in(folder))),
         )
-        poses = _find_poses([depth.parent, root], beside) if ranked else None
+        if ranked:
+            yield ranked[0], depth, beside
+
+
+def _layout(root: Path) -> _Layout | None:
+    pairs = list(_pairs_of_folders(root))
+    for colour, depth, beside in pairs:
+        poses = _find_poses([depth.parent, root], beside)
         if poses is not None:
-            return _Layout(ranked[0], depth, poses)
-    return None
+            return _Layout(colour, depth, poses)
+    named = [_Layout(colour, depth, None) for colour, depth, _ in pairs if words_of(colour.name) & COLOUR_WORDS]
+    return next((one for one in named if _holds_depth(one.depth) and any(map(_values, _camera_files(root, one)))), None)
+
+
+def _holds_depth(folder: Path) -> bool:
+    """Whether maps are depth, and not pictures of it."""
+    first = images_in(folder, DEPTH_FILES)[0]
+    try:
+        return first.suffix.lower() in (".npy", ".pfm", ".exr") or read_header(read_bytes(first), first).deep
+    except InputError:
+        return False
 
 
 def _find_poses(places: Sequence[Path], folders: Sequence[Path]) -> _Poses | None:
@@ -284,10 +340,7 @@ def _poses_of(images: Sequence[Path], poses: _Poses, root: Path) -> dict[int, Ar
 
 def _camera(root: Path, layout: _Layout, size: tuple[int, int]) -> tuple[Intrinsics, float | None, str]:
     """The colour camera, stored depth values for each unit (None: not given), and the file that has them."""
-    places = dict.fromkeys((layout.depth.parent, root, layout.colour))
-    candidates = [file for place in places for pattern in CAMERA_FILES for file in files_in(place, pattern) if file != layout.poses.file]
-    named = [file for file in candidates if words_of(file.stem) & CAMERA_WORDS or file.suffix in (".yaml", ".yml")]
-    for file in sorted(named, key=lambda file: (bool(words_of(file.stem) & DEPTH_WORDS), natural_key(file.name))):
+    for file in _camera_files(root, layout):
         values = _values(file)
         if values:
             camera = _intrinsics(values, size, str(file))
@@ -295,10 +348,21 @@ def _camera(root: Path, layout: _Layout, size: tuple[int, int]) -> tuple[Intrins
             if factor is not None and not 0 < factor < 1e9:
                 raise InputError(f"{file}: the depth factor is {factor:g}, it must be positive; correct it")
             return camera, factor, file.relative_to(root).as_posix()
+    lists = "" if layout.poses is None else f" ({layout.poses.file.name})"
     raise InputError(
-        f"{root} holds colour, depth and poses ({layout.poses.file.name}) but no camera; "
+        f"{root} holds colour, depth and poses{lists} but no camera; "
         "add intrinsics.txt with fx fy cx cy (pixels), or a 3×3 matrix"
     )
+
+
+def _camera_files(root: Path, layout: _Layout) -> list[Path]:
+    """Files that may hold the colour camera, the likeliest first."""
+    places = dict.fromkeys((layout.depth.parent, root, layout.colour))
+    candidates = [file for place in places for pattern in CAMERA_FILES for file in files_in(place, pattern)]
+    if layout.poses is not None:
+        candidates = [file for file in candidates if file != layout.poses.file]
+    named = [file for file in candidates if words_of(file.stem) & CAMERA_WORDS or file.suffix in (".yaml", ".yml")]
+    return sorted(named, key=lambda file: (bool(words_of(file.stem) & DEPTH_WORDS), natural_key(file.name)))
 
 
 def _values(file: Path) -> dict[str, list[float]]:

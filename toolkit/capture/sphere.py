@@ -8,7 +8,7 @@ Of a fisheye lens as few views are cut as keep `ENOUGH` of what it shows.
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from functools import lru_cache
 from pathlib import Path
@@ -22,7 +22,7 @@ from fieldfuse.capture.calibration import fitted
 from fieldfuse.capture.checks import check_capture
 from fieldfuse.capture.convert import MOST_AT_ONCE, PIXELS_AT_ONCE, save_image, still_good
 from fieldfuse.capture.headers import image_header
-from fieldfuse.capture.images import load_depth, load_image, load_mask, turns_by_exif
+from fieldfuse.capture.images import load_depth, load_image, load_mask, spread, turns_by_exif
 from fieldfuse.capture.listing import counted
 from fieldfuse.capture.types import CUT, Capture, Frame
 from fieldfuse.files import atomic_path, fingerprint
@@ -37,6 +37,8 @@ FIELD = 90.0  # degrees across a view
 ENOUGH = 0.95  # of the solid angle that a lens shows: what its views have to keep
 AROUND = 6  # views of a panorama along the horizon
 SAMPLES = 4000  # directions that shares are measured by
+LOOKED_AT, CIRCLE = 12, 256  # fisheye images by which the image circle is found, and their pixels across
+UNLIT, LEAST_OUTSIDE = 12, 0.01  # grey level below which a pixel is black; share of an image outside the circle that matters
 WRAP = 4  # columns of a panorama that are repeated beyond its edges, for interpolation
 # Of a fisheye lens: is there a view along the axis, how many around it, and from where these are counted (in steps, from the right)
 PATTERNS = ((True, 0, 0.0), *((False, 2, at) for at in (0.0, 0.5)), (False, 3, 0.0), (True, 2, 0.0), (False, 4, 0.5))
@@ -213,13 +215,14 @@ def cut_images(capture: Capture, out: Path, threads: int, progress: Progress = S
     names = {i: _names(frame) for i, frame in frames.items()}
     states = {i: fingerprint(VERSION, side, frame.intrinsics, exif, *_state(frame)) for i, frame in frames.items()}
     done = still_good(folder, {name: states[i] for i in indices for name in names[i]})
+    lit = image_circles(list(frames.values()), exif) if len(done) < sum(map(len, names.values())) else {}
     finished = 0
 
     def cut(index: int) -> tuple[int, list[Frame]]:
         nonlocal finished
         progress.check()
         where = {folder / name: done.get(name) for name in names[index]}
-        written = list(_cut(frames[index], capture, where, side))
+        written = list(_cut(frames[index], capture, where, side, lit.get(image_header(frames[index].image).size)))
         finished += 1
         progress.update(finished, len(indices), f"views of {finished} of {counted(len(indices), 'picture')}")
         return index, written
@@ -232,6 +235,28 @@ def cut_images(capture: Capture, out: Path, threads: int, progress: Progress = S
     remark = [f"{capture.extra[CUT]}; the views lie in the run's frames/{VIEWS}, and exported cameras are theirs"]
     remark += [f"the depth of {counted(deep, 'panorama')} is not used, since it is not measured along one axis"] if deep else []
     return check_capture(capture.with_frames(every, *remark), progress)
+
+
+def image_circles(frames: Sequence[Frame], exif: bool) -> dict[tuple[int, int], Array]:
+    """What fisheye lenses light up of their images, by the images' size as stored, where that is less than all: (h, w) bool, `CIRCLE`
+    pixels across. Beyond the image circle of some of them all images are black, up to the border."""
+    brightest: dict[tuple[int, int], Array] = {}
+    fisheye = [frame for frame in frames if not _is_panorama(frame)]
+    for frame in spread(fisheye, LOOKED_AT):
+        image = load_image(frame, exif=exif)[..., :3]
+        height = max(1, round(CIRCLE * image.shape[0] / image.shape[1]))
+        small = cv2.resize(image, (CIRCLE, height), interpolation=cv2.INTER_AREA).max(axis=2)
+        size = image_header(frame.image).size
+        before = brightest.setdefault(size, small)
+        brightest[size] = np.maximum(before, small) if before.shape == small.shape else before
+    found = {}
+    for size, grey in brightest.items():
+        _, part = cv2.connectedComponents((grey < UNLIT).astype(np.uint8))
+        border = np.unique(np.concatenate([part[0], part[-1], part[:, 0], part[:, -1]]))
+        outside = np.isin(part, border[border > 0])
+        if outside.mean() > LEAST_OUTSIDE:
+            found[size] = ~cv2.dilate(outside.astype(np.uint8), np.ones((3, 3), np.uint8)).astype(bool)  # the rim is half lit
+    return found
 
 
 def _is_panorama(frame: Frame) -> bool:
@@ -249,8 +274,8 @@ def _state(frame: Frame) -> list[object]:
     return [frame.image, frame.mask or "", frame.depth or "", frame.confidence or "", shown, frame.mask_excludes]
 
 
-def _cut(frame: Frame, capture: Capture, done: dict[Path, Path | None], side: int) -> Iterator[Frame]:
-    """The views of a frame, written unless they are `done` (file without its suffix → file)."""
+def _cut(frame: Frame, capture: Capture, done: dict[Path, Path | None], side: int, lit: Array | None) -> Iterator[Frame]:
+    """The views of a frame, written unless they are `done` (file without its suffix → file); `lit` as of `image_circles`."""
     exif, camera = turns_by_exif(capture), frame.intrinsics
     assert camera is not None
     views, _ = views_of(camera, side)
@@ -267,8 +292,9 @@ def _cut(frame: Frame, capture: Capture, done: dict[Path, Path | None], side: in
                 source = fitted(frame.depth_intrinsics or camera, (depth.shape[1], depth.shape[0]), str(frame.depth))
                 _save_array(depth_path, depth_in_view(depth, source, view) * np.float32(capture.depth_scale))
             pixels, seen = cut_view(image, camera, view)
-            if allowed is not None:
-                seen &= _nearest(allowed, camera, view)
+            for usable in (allowed, lit):
+                if usable is not None:
+                    seen &= _nearest(usable, camera, view)
             _remove_or_save_mask(mask_path, seen)
             path = save_image(pixels, target, frame.image)  # last: where it is, the others are
         pose = np.eye(4)

@@ -16,6 +16,7 @@ from typing import Any
 from fieldfuse.camera import Intrinsics
 from fieldfuse.capture import nerf_json
 from fieldfuse.capture.calibration import fitted
+from fieldfuse.capture.exr import SUFFIX as EXR
 from fieldfuse.capture.headers import image_header
 from fieldfuse.capture.listing import assemble, counted, number, read_object, require_folder
 from fieldfuse.capture.ply_points import read_ply_points
@@ -86,7 +87,8 @@ def read_transforms(path: Path | str, within: Path | None = None) -> Capture:
         else:
             points = read_ply_points(ply)
     # instant-ngp's `integer_depth_scale` is in the file's own unit, nerfstudio's factor is not.
-    factor = (_positive(data, "depth_unit_scale_factor", json_path) or 1e-3) * (applied_scale or 1.0)
+    in_metres = any(frame.depth is not None and frame.depth.suffix.lower() == EXR for frame in frames)  # as all that write OpenEXR have it
+    factor = (_positive(data, "depth_unit_scale_factor", json_path) or (1.0 if in_metres else 1e-3)) * (applied_scale or 1.0)
     return assemble(
         "transforms",
         root,

@@ -12,6 +12,7 @@ import numpy as np
 from fieldfuse.camera import Array, Intrinsics
 from fieldfuse.tone import Tone
 
+MODEL_NAMES = "model_names"  # in `Capture.extra`: of frames by name, what COLMAP's model calls their images
 CUT = "cut"  # in `Capture.extra`: into what views images are cut, in a sentence (`sphere`)
 SAME_EXPOSURE = 1e-3  # gains are written with six digits, and their mean is 1 by no more
 

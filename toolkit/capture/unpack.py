@@ -4,6 +4,7 @@ checked before one is written: no name leads anywhere else, nothing is a link, a
 
 from __future__ import annotations
 
+import os
 import re
 import shutil
 import stat
@@ -15,7 +16,7 @@ from pathlib import Path, PurePosixPath
 
 from fieldfuse.capture.archive import open_archive
 from fieldfuse.capture.record3d import holds_record3d
-from fieldfuse.errors import FieldfuseError, InputError, OutputError, brief, first_line
+from fieldfuse.errors import InputError, OutputError, brief, first_line
 from fieldfuse.files import atomic_path, fingerprint, read_json, remove, write_json
 from fieldfuse.progress import SILENT, Progress
 
@@ -24,6 +25,7 @@ SUFFIX = ".zip"
 MOST_FILES = 200_000
 MOST_TIMES, MOST_BYTES = 100, 2**28  # what files become when they are unpacked: so many times the zip file's size, and so much
 MARKER = ".source.json"  # in the folder: which zip file it is of
+LONGEST, LONGEST_PART = 2000, 240  # bytes of a file's name with its folders, and of each
 CHUNK = 2**20
 
 
@@ -86,19 +88,23 @@ def unpack(archive: Path, folder: Path, progress: Progress = SILENT) -> None:
         for number, (name, member) in enumerate(members.items()):
             progress.check()
             progress.update(number, len(members), f"unpacking {brief(name)}")
-            try:
-                target = temporary.joinpath(*PurePosixPath(name).parts)
-                target.parent.mkdir(parents=True, exist_ok=True)
-                with opened.open(member) as packed, target.open("xb") as file:
-                    shutil.copyfileobj(packed, file, CHUNK)
-            except (FieldfuseError, OSError):
-                raise
-            except Exception as error:  # zipfile and zlib raise many families
-                raise InputError(
-                    f"{brief(name)} in {archive} cannot be unpacked ({first_line(error)}); copy the zip file again, or unpack it by "
-                    "another program and give the folder"
-                ) from error
+            target = temporary.joinpath(*PurePosixPath(name).parts)
+            target.parent.mkdir(parents=True, exist_ok=True)
+            with target.open("xb") as file:
+                for chunk in _chunks(opened, member, f"{brief(name)} in {archive}"):
+                    file.write(chunk)
         write_json(temporary / MARKER, state)
+
+
+def _chunks(opened: zipfile.ZipFile, member: zipfile.ZipInfo, what: str) -> Iterator[bytes]:
+    try:
+        with opened.open(member) as packed:
+            while chunk := packed.read(CHUNK):
+                yield chunk
+    except Exception as error:  # zipfile, zlib and the system raise many families on damaged files
+        raise InputError(
+            f"{what} cannot be unpacked ({first_line(error)}); copy the zip file again, or unpack it by another program and give the folder"
+        ) from error
 
 
 def folder_around(root: Path) -> Path | None:
@@ -118,18 +124,22 @@ def _members(archive: Path) -> dict[str, zipfile.ZipInfo]:
         if re.match(r"/|[A-Za-z]:", name) or ".." in name.split("/"):
             raise InputError(f"{archive} holds {brief(repr(name))}, a name that leads out of its folder; make the zip file anew")
         parts = PurePosixPath(name).parts
-        if member.is_dir() or name.endswith("/") or not parts or any(part.startswith((".", "__MACOSX")) for part in parts):
+        if len(os.fsencode(name)) > LONGEST or any(len(os.fsencode(part)) > LONGEST_PART for part in parts):
+            raise InputError(f"{archive} holds {brief(repr(name))}, a name too long for a file; make the zip file anew, with shorter ones")
+        if name.endswith("/") or not parts or any(part.startswith((".", "__MACOSX")) for part in parts):
             continue
         if stat.S_ISLNK(member.external_attr >> 16):
             raise InputError(f"{archive} holds {brief(repr(name))}, which is a link; make the zip file anew, with the file itself")
         if member.flag_bits & 1:
             raise InputError(f"{archive} is locked by a password; unpack it, and give the folder")
         name = "/".join(parts)
-        if name in found or any("/".join(parts[:depth]) in found for depth in range(1, len(parts))):
+        if name in found:
             raise InputError(f"{archive} holds {brief(repr(name))} twice; make the zip file anew")
         found[name] = member
         if len(found) > MOST_FILES:
             raise InputError(f"{archive} holds more than {MOST_FILES} files; give one capture")
+    if both := next((str(parent) for name in found for parent in PurePosixPath(name).parents if str(parent) in found), None):
+        raise InputError(f"{archive} holds {brief(repr(both))} twice, as a file and as a folder; make the zip file anew")
     if not found:
         raise InputError(f"{archive} is empty; make the zip file anew from the capture's folder")
     total, most = sum(member.file_size for member in found.values()), MOST_BYTES + MOST_TIMES * archive.stat().st_size

@@ -18,7 +18,8 @@ from fieldfuse.errors import InputError
 
 MOST_BAD = 0.2  # share of the frames that may be excluded; with more of them something is wrong with the capture
 MIN_FRAMES = 3  # frames that have to stay
-BESIDE = ("transforms", "blender", "colmap", "llff")  # kinds whose images may be photos as a camera wrote them
+# Kinds whose images may be photos as a camera wrote them.
+BESIDE = ("transforms", "blender", "colmap", "llff", "metashape", "realitycapture", "opensfm", "meshroom", "bundler")
 
 
 def without(capture: Capture, bad: Mapping[str, str], refusal: str | None = None) -> Capture:

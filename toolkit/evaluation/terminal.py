@@ -50,6 +50,8 @@ def _facts(data: dict[str, Any]) -> list[str]:
         if poses["registered"] is not None and poses["total"] is not None:
             line += f", {poses['registered']} of {poses['total']} with a pose"
         lines.append(line)
+    if poses.get("scaling"):
+        lines.append(f"lengths in metres: {poses['scaling']['text']}")
     if field["voxels"] is not None:
         voxels, blocks = words.whole(field["voxels"]), words.whole(field["blocks"])
         lines.append(f"field of {voxels} voxels in {blocks} blocks, {words.size(field['bytes'])} in memory")

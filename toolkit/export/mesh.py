@@ -68,10 +68,8 @@ def write_textured(path: Path | str, mesh: Mesh, atlas: Atlas, texture: Array, w
     if working_from_input is not None:
         mesh = mesh.transformed(working_from_input.inverse())
     offset = np.zeros(3) if single_precision(mesh.vertices) else mesh.bounds().mean(axis=0)
-    packed = io.BytesIO()
-    # Neighbouring triangles of the texture need not be neighbours in space, so colours are kept for each texel, not for four of them.
-    Image.fromarray(texture).save(packed, format="JPEG", quality=JPEG_QUALITY, subsampling=0)
-    material = PBRMaterial(baseColorTexture=Image.open(packed), metallicFactor=0.0, roughnessFactor=1.0)
+    packed = packed_texture(texture)
+    material = PBRMaterial(baseColorTexture=Image.open(io.BytesIO(packed)), metallicFactor=0.0, roughnessFactor=1.0)
     visual = TextureVisuals(uv=atlas.coordinates().reshape(-1, 2), material=material)
     # Each triangle has a place of its own in the texture, so it has vertices of its own.
     vertices = (mesh.vertices - offset)[mesh.triangles].reshape(-1, 3)
@@ -80,12 +78,19 @@ def write_textured(path: Path | str, mesh: Mesh, atlas: Atlas, texture: Array, w
 
     def put_picture(buffers: dict[Any, bytes], tree: dict[str, Any]) -> None:
         """In place of what trimesh makes of the image, which it packs again, worse."""
-        data = packed.getvalue()
-        buffers[list(buffers)[tree["images"][0]["bufferView"]]] = data + bytes(-len(data) % 4)
+        buffers[list(buffers)[tree["images"][0]["bufferView"]]] = packed + bytes(-len(packed) % 4)
 
     data = _as_glb(solid, offset, include_normals=False, buffer_postprocessor=put_picture, tree_postprocessor=_unlit)
     with atomic_path(path) as temporary:
         temporary.write_bytes(data)
+
+
+def packed_texture(texture: Array) -> bytes:
+    """(S, S, 3) uint8 as JPEG."""
+    packed = io.BytesIO()
+    # Neighbouring triangles of the texture need not be neighbours in space, so colours are kept for each texel, not for four of them.
+    Image.fromarray(texture).save(packed, format="JPEG", quality=JPEG_QUALITY, subsampling=0)
+    return packed.getvalue()
 
 
 def _unlit(tree: dict[str, Any]) -> None:
@@ -120,20 +125,25 @@ def to_trimesh(mesh: Mesh, offset: Array | None = None) -> trimesh.Trimesh:
 def _write_obj(path: Path, mesh: Mesh) -> None:
     normals = mesh.normals
     # Nine digits hold a float32; a model far from its frame's origin needs all seventeen of a float64.
-    vertex = "v {0} {0} {0} {{:.5g}} {{:.5g}} {{:.5g}}\n".format("{:.9g}" if single_precision(mesh.vertices) else "{:.17g}")
+    vertex = "v {0} {0} {0} %.5g %.5g %.5g\n".format("%.9g" if single_precision(mesh.vertices) else "%.17g")
     with atomic_path(path) as temporary, temporary.open("w", encoding="ascii") as file:
         file.write("# vertices: x y z red green blue (colours 0 to 1)\n")
         for start in range(0, len(mesh.vertices), ROWS_AT_ONCE):
             part = slice(start, start + ROWS_AT_ONCE)
             rows = np.concatenate([mesh.vertices[part], mesh.colours[part] / 255], axis=1)
-            file.writelines(vertex.format(*row) for row in rows.tolist())
+            file.write(_lines(vertex, rows))
             if normals is not None:
-                file.writelines("vn {:.5g} {:.5g} {:.5g}\n".format(*row) for row in normals[part].tolist())
-        template = "f {}//{} {}//{} {}//{}\n" if normals is not None else "f {} {} {}\n"
+                file.write(_lines("vn %.5g %.5g %.5g\n", normals[part]))
+        template = "f %d//%d %d//%d %d//%d\n" if normals is not None else "f %d %d %d\n"
         for start in range(0, len(mesh.triangles), ROWS_AT_ONCE):
             corners = mesh.triangles[start : start + ROWS_AT_ONCE] + 1
             rows = np.repeat(corners, 2, axis=1) if normals is not None else corners
-            file.writelines(template.format(*row) for row in rows.tolist())
+            file.write(_lines(template, rows))
+
+
+def _lines(template: str, rows: Array) -> str:
+    """Each row of numbers as a line: all at once takes half the time."""
+    return (template * len(rows)) % tuple(rows.reshape(-1).tolist())
 
 
 def _write_glb(path: Path, mesh: Mesh) -> None:

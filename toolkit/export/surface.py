@@ -16,6 +16,7 @@ from fieldfuse.capture.types import Capture, Views
 from fieldfuse.config import ExportSettings, Settings
 from fieldfuse.errors import InputError
 from fieldfuse.memory import PICTURE_BYTES, SURFACE_BYTES, pixels, require_pictures
+from fieldfuse.poses.region import Region
 from fieldfuse.progress import SILENT, Progress
 
 if TYPE_CHECKING:
@@ -114,9 +115,15 @@ class Originals:
 
 
 def surface_of_field(
-    field: Field, views: Views, scene: Scene, settings: Settings, originals: Originals, progress: Progress = SILENT
+    field: Field,
+    views: Views,
+    scene: Scene,
+    settings: Settings,
+    originals: Originals,
+    progress: Progress = SILENT,
+    crop: Region | None = None,
 ) -> TsdfVolume:
-    """The field's surface in the region of interest, working frame. Held-out images are not looked at.
+    """The field's surface in the region of interest, working frame, and within `crop`. Held-out images are not looked at.
 
     Raises:
         InputError: the field has no surface, or there is too little memory.
@@ -141,7 +148,9 @@ def surface_of_field(
     def render(lens: Intrinsics, pose: Array) -> Rendered:
         return render_view(field, at_most(lens, RENDERED_SIDE), pose, view)
 
-    return field_volume(render, shown.world_from_camera[chosen], lenses, None, scene.surface_box(), refinement, progress)
+    region = Region.box(*scene.surface_box())
+    region = region if crop is None else region.both(crop)
+    return field_volume(render, shown.world_from_camera[chosen], lenses, None, region, refinement, progress)
 
 
 def field_volume(
@@ -149,7 +158,7 @@ def field_volume(
     poses: Array,
     cameras: Sequence[Intrinsics],
     voxel_size: float | None = None,
-    region: tuple[Array, Array] | None = None,
+    region: Region | None = None,
     refinement: Refinement = Refinement(),
     progress: Progress = SILENT,
 ) -> TsdfVolume:
@@ -160,7 +169,7 @@ def field_volume(
     Args:
         cameras: one a pose.
         voxel_size: working units; None: from the rendered depth, made coarser until it fits into memory.
-        region: lowest and highest corner (3,) of the box that is kept, working frame.
+        region: what is kept, working frame; None: all.
 
     Raises:
         InputError: no view shows a surface, or the given voxel size is too fine for the memory.
@@ -234,14 +243,14 @@ def _rendered_frame(
     return frame, opaque, shown
 
 
-def _within(frame: DepthFrame, region: tuple[Array, Array]) -> DepthFrame:
-    """The frame without depth of points outside the box (lowest corner, highest corner)."""
+def _within(frame: DepthFrame, region: Region) -> DepthFrame:
+    """The frame without depth of points outside the region."""
     depth, camera, pose = frame.depth.copy(), frame.depth_intrinsics, frame.world_from_camera
     v, u = np.nonzero(depth)
     z = depth[v, u].astype(np.float64)
     points = np.stack([(u + 0.5 - camera.cx) / camera.fx * z, (v + 0.5 - camera.cy) / camera.fy * z, z], axis=1)
     points = points @ pose[:3, :3].T + pose[:3, 3]
-    outside = ((points < region[0]) | (points > region[1])).any(axis=1)
+    outside = ~region.inside(points)
     depth[v[outside], u[outside]] = 0
     return replace(frame, depth=depth)
 

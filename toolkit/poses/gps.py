@@ -52,7 +52,8 @@ def fit_gps(centres: Array, places: Array) -> Placed | str:
         flat = np.isfinite(places[:, :2]).all(axis=1).sum()
         return f"{there.sum()} images have a place with altitude" + (f" ({flat} one without)" if flat > there.sum() else "")
     centres, places = centres[there], places[there]
-    origin = Georeference(*(float(value) for value in np.median(places, axis=0)))
+    latitude, longitude, altitude = np.median(places, axis=0).tolist()
+    origin = Georeference(latitude, longitude, altitude)
     target = origin.enu_of(places)
     best = _consensus(centres, target)
     if best is None:

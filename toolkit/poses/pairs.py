@@ -27,6 +27,7 @@ EVERY_STEP = (*range(1, 11), *FAR_STEPS)
 FEW_FRAMES = 60  # up to which every step of the next ten is taken: frames lie far apart there, and each match counts
 BESIDE = 2  # instants from one to the other of which views that look the same way are matched whatever they share
 MIN_COMMON_VIEWS = 3  # coarse matches between two views, of instants that go together
+FEW_INSTANTS, EACH_INSTANT = 12, 8  # instants of which all are matched with each other, and those that one is matched with of more
 EACH_VIEW = 2  # views of another instant that one is matched with at most
 LOOPS = 3  # such pairs of a frame at most
 LOOP_GAP = 20  # frames apart before a pair counts as a loop
@@ -62,10 +63,10 @@ def view_pairs(job: Job, sketches: list[Array]) -> Pairs:
     if job.sequential:
         loops = loop_pairs(whole, stride=max(1, -(-count // LOOP_ANCHORS)))
         together = sorted({*sequential_pairs(count, STEPS), *loops})
-    elif count <= MAX_EXHAUSTIVE:
+    elif count <= FEW_INSTANTS:
         together = list(combinations(range(count), 2))
     else:
-        together = similar_pairs(whole)
+        together = similar_pairs(whole, EACH_INSTANT)
     pairs = set[tuple[int, int]]()
     for one, other in together:
         matched = matches_of(whole[one], whole[other])

@@ -1,13 +1,14 @@
 """The frame that the cameras decide (z up), and the region of interest in it: the box that gets the fine volume, because it is what the
-cameras look at."""
+cameras look at; and regions in general."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass
 
 import numpy as np
+from scipy.spatial import ConvexHull, QhullError
 
-from fieldfuse.camera import Array
+from fieldfuse.camera import Array, Similarity
 from fieldfuse.poses.overlap import convergence
 
 LEVEL = 0.25  # eigenvalue ratio below which the cameras' x axes lie in a plane (held level while turning)
@@ -181,3 +182,38 @@ def points_of_interest(found: Layout, points: Array, views: Array, bounded: bool
     if np.count_nonzero(inside) < min(MIN_POINTS, len(points) // 4):
         return everything, weights, BEST
     return inside, weights, BEST
+
+
+@dataclass(frozen=True)
+class Region:
+    """A convex part of space: all x with `normals` · x ≤ `offsets`, (K, 3) and (K,) float64."""
+
+    normals: Array
+    offsets: Array
+
+    @classmethod
+    def box(cls, low: Array, high: Array) -> Region:
+        """From its lowest and highest corner (3,)."""
+        return cls(np.concatenate([np.eye(3), -np.eye(3)]), np.concatenate([high, -np.asarray(low, dtype=np.float64)]))
+
+    @classmethod
+    def hull(cls, points: Array) -> Region | None:
+        """The convex hull of (P, 3) points; None where they span no volume."""
+        try:
+            equations = ConvexHull(points).equations
+        except (QhullError, ValueError):
+            return None
+        return cls(equations[:, :3], -equations[:, 3])
+
+    def moved(self, to: Similarity) -> Region:
+        """The same region in the frame that `to` leads to."""
+        normals = to.directions(self.normals)
+        return Region(normals, to.scale * self.offsets + normals @ to.translation)
+
+    def both(self, other: Region) -> Region:
+        """What lies in this one and in the other."""
+        return Region(np.concatenate([self.normals, other.normals]), np.concatenate([self.offsets, other.offsets]))
+
+    def inside(self, points: Array) -> Array:
+        """(N,) bool of (N, 3) points."""
+        return np.asarray((points @ self.normals.T <= self.offsets).all(axis=-1))

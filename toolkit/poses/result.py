@@ -20,6 +20,7 @@ FEW, SHARE = 6, 0.1  # images with poses, and their share of all, below which th
 DEPTH_FRAMES = 12  # depth maps that a scale is taken from
 MIN_POINTS = 50  # points with depth that make a scale believable
 SPREAD = 0.25  # relative spread (half the 20–80% range) of depth ratios above which sensor and model disagree
+ADDED = ("up", "georeference", "scaling")
 
 
 @dataclass
@@ -45,15 +46,14 @@ class PoseResult:
     agreement: dict[str, Any] | None = None  # of given poses with the images: `share`, `matches`, `pairs`, `reading`; None: not measured
 
     def to_dict(self) -> dict[str, Any]:
-        """Plain JSON. Points have float32's seven digits, poses all."""
+        """Plain JSON, without what `scaling.Scaling` adds. Points have float32's seven digits, poses all."""
         return {
-            **{entry.name: getattr(self, entry.name) for entry in fields(self)},
+            **{entry.name: getattr(self, entry.name) for entry in fields(self) if entry.name not in ADDED},
             "intrinsics": [camera.to_dict() for camera in self.intrinsics],
             "world_from_camera": np.asarray(self.world_from_camera, dtype=np.float64).tolist(),
             "points": None if self.points is None else _short(self.points, 7),
             "point_errors": None if self.point_errors is None else _short(self.point_errors, 4),
             "seconds": {key: round(float(value), 3) for key, value in self.seconds.items()},
-            "georeference": None if self.georeference is None else self.georeference.to_dict(),
         }
 
     @classmethod
@@ -72,7 +72,7 @@ class PoseResult:
             cameras = [Intrinsics.from_dict(camera) for camera in data["intrinsics"]]
             if len(cameras) != len(names):
                 raise ValueError("as many cameras as names are needed")
-            points, errors, up, place = (data.get(name) for name in ("points", "point_errors", "up", "georeference"))
+            points, errors = data.get("points"), data.get("point_errors")
             return cls(
                 source=str(data["source"]),
                 registered=int(data["registered"]),
@@ -87,9 +87,6 @@ class PoseResult:
                 warnings=[str(text) for text in data["warnings"]],
                 seconds={str(key): float(value) for key, value in data["seconds"].items()},
                 metric=bool(data.get("metric", False)),
-                up=None if up is None else (float(up[0]), float(up[1]), float(up[2])),
-                georeference=None if place is None else Georeference.from_dict(place),
-                scaling=data.get("scaling"),
                 agreement=data.get("agreement"),
             )
         except (KeyError, TypeError, ValueError, OverflowError, AttributeError) as error:

@@ -17,7 +17,7 @@ from fieldfuse.capture.photos import FOLDERS
 from fieldfuse.capture.types import Capture, Frame
 from fieldfuse.config import PosesSettings
 from fieldfuse.errors import InputError, first_line
-from fieldfuse.georeference import Georeference
+from fieldfuse.georeference import Georeference, usable_similarity
 from fieldfuse.measures import parse_marker, parse_scale
 from fieldfuse.poses.clicked import check_marks, scale_by_marks
 from fieldfuse.poses.gps import LEAST, SHARE, Placed, fit_gps
@@ -27,6 +27,7 @@ from fieldfuse.progress import SILENT, Progress
 
 REFERENCE = "reference_lla"  # in `Capture.extra`: degrees north, degrees east, metres of the origin of a frame that is east, north, up
 GPS, MARKS, MARKERS = "gps", "scale", "marker"
+FACTS = ("source", "factor", "error", "text")
 DIFFERS = 3.0  # standard deviations by which two sources of scale may differ
 LOOKED_AT = 12  # images whose GPS decides whether all are looked at
 
@@ -61,13 +62,13 @@ class Scaling:
         try:
             place = data["georeference"]
             return cls(
-                move=Similarity.from_dict(data["move"]),
+                move=usable_similarity(data["move"]),
                 metric=bool(data["metric"]),
                 georeference=None if place is None else Georeference.from_dict(place),
-                facts=data["facts"],
+                facts=None if data["facts"] is None else _facts(*(data["facts"][name] for name in FACTS)),
                 warnings=tuple(str(text) for text in data["warnings"]),
             )
-        except (KeyError, TypeError, ValueError, AttributeError) as error:
+        except (KeyError, TypeError, ValueError, AttributeError, OverflowError) as error:
             raise InputError(f"scaling.json is not what a run writes ({first_line(error)}); remove it and run again") from error
 
     def apply(self, capture: Capture, poses: PoseResult) -> tuple[Capture, PoseResult]:
@@ -191,7 +192,9 @@ def _on_earth(placed: Placed, sized: Sized | None, source: str, poses: PoseResul
 
 
 def _facts(source: str, factor: float, error: float, text: str) -> dict[str, Any]:
-    return {"source": source, "factor": float(factor), "error": float(error), "text": text}
+    if not (0 < float(factor) < np.inf and 0 <= float(error) < np.inf):
+        raise ValueError("a factor must be positive, its error at least 0")
+    return dict(zip(FACTS, (str(source), float(factor), float(error), str(text)), strict=True))
 
 
 def _placed(capture: Capture, poses: PoseResult, warnings: list[str]) -> Placed | None:

@@ -56,6 +56,17 @@ class Splats:
         """(N, 3) float64."""
         return self.values[:, :3].astype(np.float64) + self.origin
 
+    def take(self, which: Array) -> Splats:
+        """Those of the Gaussians, by their indices or (N,) bool.
+
+        Raises:
+            InputError: none.
+        """
+        values = self.values[which]
+        if not len(values):
+            raise InputError("no Gaussian lies in the region that is to be exported; its numbers are in the frame of the input")
+        return Splats(np.ascontiguousarray(values), self.origin)
+
     def render(self, intrinsics: Intrinsics, world_from_camera: Array, background: Array | None = None) -> Rendered:
         """What a pinhole camera at `world_from_camera` (4, 4), in the splats' frame, sees; `background`: (3,), None: black."""
         image = draw(self.values, lens_of(self, intrinsics, world_from_camera)).image

@@ -17,13 +17,13 @@ from PIL import Image
 from fieldfuse.camera import Intrinsics, Similarity, opengl_from_world
 from fieldfuse.capture import open_capture
 from fieldfuse.capture.checks import check_capture
+from fieldfuse.capture.gps import gps_of_images
 from fieldfuse.capture.images import load_image, load_mask
 from fieldfuse.capture.ply_points import read_ply_points
 from fieldfuse.capture.prepare import prepare_views
 from fieldfuse.capture.sphere import cut_view, to_cut, views_of
 from fieldfuse.capture.storage import capture_from_dict, capture_to_dict, load_views, save_views
 from fieldfuse.capture.types import Capture, Views
-from fieldfuse.capture.unpack import unpacked
 from fieldfuse.capture.video import iterate_video, read_video
 from fieldfuse.config import CaptureSettings, load_settings
 from fieldfuse.files import read_json, write_json
@@ -110,6 +110,14 @@ FILES = {
     "stray": ("odometry.csv", "camera_matrix.csv", "depth/000001.png"),
     "record3d": ("metadata", "metadata", "rgbd/1.depth", "rgbd/0.depth", "rgbd/2.conf", "rgbd/0.jpg"),
     "scanner3d": ("frame_00002.json", "frame_00004.json", "depth_00002.png", "conf_00000.png"),
+    "metashape": ("cameras.xml",),
+    "realitycapture": ("registration.csv",),
+    "xmp": ("IMG_02.xmp", "IMG_03.xmp"),
+    "opensfm": ("opensfm/reconstruction.json",),
+    "meshroom": ("MeshroomCache/StructureFromMotion/0a1b/cameras.sfm",),
+    "bundler": ("bundle.out", "list.txt"),
+    "scannetpp": ("dslr/nerfstudio/transforms_undistorted.json", "dslr/train_test_lists.json"),
+    "arkitscenes": ("lowres_wide.traj", "lowres_wide_intrinsics/41069021_305.377.pincam", "lowres_depth/41069021_305.477.png"),
 }
 
 
@@ -122,19 +130,6 @@ def make_recording(root: Path) -> None:
     root.mkdir(parents=True, exist_ok=True)
     zipped(source, root / "a.r3d")
     shutil.rmtree(source)
-
-
-def make_zip(root: Path) -> None:
-    source = root.with_name(f"{root.name}-unpacked")
-    LAYOUTS["transforms"][1](source)
-    root.mkdir(parents=True, exist_ok=True)
-    zipped(source, root / "a.zip", "scan/")
-    shutil.rmtree(source)
-
-
-def read_zip(root: Path, number: int) -> None:
-    with unpacked(root / "a.zip") as place:
-        read_capture(place, number)
 
 
 def make_extras(root: Path) -> None:
@@ -192,6 +187,7 @@ def make_photos(root: Path) -> None:
     tags = Image.Exif()
     tags[0x0112], tags[0x010F] = 6, "maker"
     tags.get_ifd(0x8769)[0xA405] = 28
+    tags.get_ifd(0x8825).update({1: "N", 2: (46.0, 50.0, 33.4), 3: "W", 4: (91.0, 59.0, 40.4), 5: b"\0", 6: 198.3})
     Image.fromarray(pictures[0]).save(root / "a.jpg", exif=tags, quality=85)
     save_picture(root / "b.png", np.dstack([pictures[1], np.full((60, 80), 200, np.uint8)]))
     Image.fromarray(pictures[2]).save(root / "c.webp")
@@ -227,6 +223,9 @@ def read_photo_folder(root: Path, number: int) -> None:
     for frame in capture.frames:
         load_image(frame, exif=True)
         load_mask(frame)
+    places = gps_of_images([frame.image for frame in capture.frames])
+    if not np.isfinite(places[~np.isnan(places)]).all():
+        raise ValueError("a place that is not finite")
     if number % 4 == 0:
         check_capture(capture)
 
@@ -250,8 +249,10 @@ def read_one_video(root: Path, number: int) -> None:
 def make_runs(root: Path) -> None:
     """The files of a run's folder that later commands read."""
     from fieldfuse.config import Settings
+    from fieldfuse.georeference import Georeference
     from fieldfuse.pipelines.folder import RunFolder
     from fieldfuse.pipelines.rendered import Picture, Pictures, save_pictures
+    from fieldfuse.poses.scaling import Scaling
     from fieldfuse.poses.scene import Scene
 
     source = root / "source"
@@ -263,6 +264,9 @@ def make_runs(root: Path) -> None:
     write_json(root / "poses.json", given_poses(capture).to_dict())
     scene = Scene(Similarity.identity(), np.zeros(3), np.ones(3), 1.5, 0.1, 9.0, 0.1, True, False)
     write_json(root / "scene.json", scene.to_dict())
+    found = {"source": "gps", "factor": 2.5, "error": 0.01, "text": "the GPS of 8 of 8 images"}
+    place = Georeference(46.8, -92.0, 198.0, error=0.5)
+    write_json(root / "scaling.json", Scaling(Similarity.identity(), True, place, found, ("a note",)).to_dict())
     record = {
         "name": "views",
         "key": "a",
@@ -293,6 +297,7 @@ def read_json_files(root: Path, number: int) -> None:
     from fieldfuse.pipelines.render_path import path_fps, read_cameras
     from fieldfuse.pipelines.stages import finished_stages
     from fieldfuse.poses.result import PoseResult
+    from fieldfuse.poses.scaling import Scaling
     from fieldfuse.poses.scene import Scene
 
     folder = RunFolder(root)
@@ -302,6 +307,7 @@ def read_json_files(root: Path, number: int) -> None:
         lambda: capture_from_dict(read_json(root / "capture.json")),
         lambda: PoseResult.from_dict(read_json(root / "poses.json")),
         lambda: Scene.from_dict(read_json(root / "scene.json")),
+        lambda: Scaling.from_dict(read_json(root / "scaling.json")),
         lambda: read_cameras(root / "source" / "transforms.json"),
         lambda: read_cameras(root / "camera_path.json"),
         lambda: path_fps(root / "camera_path.json"),
@@ -328,8 +334,8 @@ def read_tensors(root: Path, number: int) -> None:
 
 
 RUN_FILES = (
-    "run.json", "capture.json", "poses.json", "scene.json", "stages/views.json", "settings.yaml", "source/transforms.json",
-    "camera_path.json",
+    "run.json", "capture.json", "poses.json", "scene.json", "scaling.json", "stages/views.json", "settings.yaml",
+    "source/transforms.json", "camera_path.json",
 )  # fmt: skip
 TRAINING_FILES = (
     "shard.safetensors", "checkpoint-0000007.safetensors", "train.yaml", "depths.safetensors", "left_out.safetensors",
@@ -339,7 +345,6 @@ PANORAMAS = ("posed/transforms.json", "posed/1.jpg", "photos/1.jpg", "fisheye/tr
 TARGETS: tuple[Target, ...] = (
     *(Target(layout, files, LAYOUTS[layout][1], read_capture, 1.0) for layout, files in FILES.items()),
     Target("recording", ("a.r3d",), make_recording, read_capture, 1.0),
-    Target("zip file", ("a.zip",), make_zip, read_zip, 1.0),
     Target("extras", ("transforms.json", "mask1.png", "depth2.npy", "points.ply"), make_extras, read_capture, 2.0),
     Target("photos", PHOTOS, make_photos, read_photo_folder, 3.0),
     Target("openexr", ("a.exr", "b.exr", "c.exr"), make_exr, read_photo_folder, 1.0),

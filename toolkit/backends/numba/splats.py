@@ -333,7 +333,8 @@ def pull_pass(flat: Any, entries: Any, starts: Any, across: Any, first: Any, las
                             alpha = min(full, OPAQUEST)
                             alpha = alpha if alpha >= FAINT and light >= STOP else ZERO
                             weight = light * alpha
-                            gr, gg, gb = acc[pixel + np.uintp(2 * PIXELS)], acc[pixel + np.uintp(3 * PIXELS)], acc[pixel + np.uintp(4 * PIXELS)]
+                            gr, gg = acc[pixel + np.uintp(2 * PIXELS)], acc[pixel + np.uintp(3 * PIXELS)]
+                            gb = acc[pixel + np.uintp(4 * PIXELS)]
                             own = red * gr + green * gg + blue * gb
                             behind -= weight * own
                             acc[pixel], acc[pixel + np.uintp(PIXELS)] = light - weight, behind

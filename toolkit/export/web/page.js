@@ -26,7 +26,7 @@ class Page {
     this.photo = about.start;
     this.walker = new Walker(poseOf(about.photos[this.photo].pose), about.depth);
     this.show = 0;
-    this.perPixel = 1e-3;  // milliseconds, learnt as it goes
+    this.perPixel = 4e-3;  // milliseconds, learnt as it goes
     this.keys = new Set();
     this.fingers = new Map();
     this.flight = null;  // {at: share of the way → pose, seconds, button, word}
@@ -210,6 +210,10 @@ class Page {
     canvas.addEventListener('dblclick', event => this.lookAt(event.clientX, event.clientY));
     window.addEventListener('keydown', event => {
       const key = event.key.toLowerCase(), on = event.target.tagName;
+      if (key === 'escape') {
+        $('keys').hidden = true;
+        this.tools.open(null);
+      }
       const typed = on === 'INPUT' && (key.startsWith('arrow') || !['range', 'checkbox'].includes(event.target.type));
       if (event.ctrlKey || event.metaKey || event.altKey || on === 'SELECT' || typed) return;
       const tool = {v: 'views', p: 'path', m: 'measure', c: 'crop'}[key];

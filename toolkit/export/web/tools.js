@@ -33,8 +33,9 @@ class Tools {
 
   digits(value) { return String(Number(value.toFixed(this.decimals))); }
 
+  // The panel of a tool, or none: where it was open, or `name` is null.
   open(name) {
-    const opened = $(name).hidden ? name : null;
+    const opened = name && $(name).hidden ? name : null;
     for (const other of this.names) {
       $(other).hidden = other !== opened;
       document.querySelector(`[data-opens=${other}]`).setAttribute('aria-pressed', other === opened);
