@@ -12,7 +12,7 @@ import numpy as np
 from fieldfuse.errors import InputError
 from fieldfuse.files import remove
 from fieldfuse.pipelines.rendered import Pictures
-from fieldfuse.pipelines.stages import Stage, StoredStage
+from fieldfuse.pipelines.stages import EndlessStage, Stage
 from fieldfuse.pipelines.surfaces import pictures_stage, render_views
 from fieldfuse.tone import exposed, unexposed
 
@@ -73,7 +73,7 @@ def make_splats(job: Job, ready: Prepared, fitted: Fitted) -> Splats:
         return [path]
 
     chosen = [settings.most, settings.degree, settings.seconds, settings.seed, export.crop]
-    return job.run(StoredStage(SPLATS, make, save, lambda: open_splats(path), ["field", "scene", "views"], chosen))
+    return job.run(EndlessStage(SPLATS, make, save, lambda: open_splats(path), ["field", "scene", "views"], chosen))
 
 
 def render_splats(job: Job, ready: Prepared, splats: Splats) -> Pictures:

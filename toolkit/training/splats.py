@@ -39,6 +39,7 @@ from fieldfuse.volume.topology import BLOCK, VOXELS
 Tensor = torch.Tensor
 SEEN = 0.05  # largest share of a pixel's light below which a voxel becomes no Gaussian
 MOST_VOXELS = 2_000_000
+MOST_THREADS = 4  # that have sums of their own: a quarter of a gigabyte each
 MOST_SIDE = 2**20  # of a lattice, voxels
 MOST_RAYS = 2_000_000  # that voxels' sums are made of; pixels are skipped evenly
 SPREAD = 2.2  # standard deviations of a Gaussian over those of the light in its voxel: neighbours overlap
@@ -140,7 +141,7 @@ def start(field: Field, targets: Targets, settings: SplatSettings, progress: Pro
 
 def _gathered(field: Field, targets: Targets, chosen: Tensor, progress: Progress) -> Array:
     """(S, SUMS) sums of the voxels `chosen`."""
-    views, threads = targets.views, torch.get_num_threads()
+    views, threads = targets.views, min(torch.get_num_threads(), MOST_THREADS)
     slots = np.full(len(field.occupied), -1, np.int32)
     slots[chosen.numpy()] = np.arange(len(chosen), dtype=np.int32)
     space, volume, turn = make_space(field), make_volume(field), targets.input_from_working.rotation
