@@ -64,7 +64,7 @@ def cut_out() -> tuple[Field, Views]:
 def test_gaussians_begin_as_the_field_and_steps_improve_them(cut_out: tuple[Field, Views]) -> None:
     field, views = cut_out
     before, after = (held_out(made(field, views, Similarity.identity(), steps), views, Similarity.identity()) for steps in (1, 60))
-    assert before > 25 and after > before + 2
+    assert before > 22 and after > before + 2
 
 
 def test_the_frame_of_the_input_changes_nothing(cut_out: tuple[Field, Views]) -> None:
