@@ -17,6 +17,7 @@ from safetensors.numpy import load_file
 from benchmarks.experiment import Experiment, Folder, Row, application, markdown, program, section, show
 from fieldfuse import steps
 from fieldfuse.camera import Array, Intrinsics, unproject
+from fieldfuse.capture.images import load_image
 from fieldfuse.capture.types import Capture
 from fieldfuse.config import PosesSettings, load_settings
 from fieldfuse.errors import InputError
@@ -86,7 +87,7 @@ def measured(folder: Path, scene: str, seed: int, frames: int, progress: Progres
     settings, setup = load_settings(), SCENES[scene]
     filmed = {**setup, "scene": scene, "seed": seed, "output": "photos", "path": {**setup["path"], "frames": frames}}
     simulate(scene_file(filmed, "the benchmark"), folder / "capture", progress=progress)
-    capture = steps.read_capture(folder / "capture" / "images", settings, progress)
+    capture = steps.read_capture(folder / "capture" / "images", folder, settings, progress)
     poses = steps.camera_poses(capture, folder, settings, progress)
     true = [entry["world_from_camera"] for entry in read_json(folder / "capture/ground_truth/cameras.json")["frames"]]
     by_name = {frame.name: np.array(pose) for frame, pose in zip(capture.frames, true, strict=True)}
@@ -119,11 +120,11 @@ def distances(root: Path, capture: Capture, poses: PoseResult, by_name: dict[str
     count, found = len(poses.names), list[str]()
     lens = Intrinsics.from_dict(read_json(root / "ground_truth/cameras.json")["intrinsics"])
     for number in range(PAIRS):
-        texts, ends = [], []
+        texts, ends = list[str](), list[Array]()
         for index in (count // 4 + number, count // 2 + number):
             name = poses.names[min(index, count - 1)]
             frame = next(frame for frame in capture.frames if frame.name == name)
-            image = cv2.imread(str(frame.image), cv2.IMREAD_GRAYSCALE)
+            image = cv2.cvtColor(load_image(frame)[..., :3], cv2.COLOR_RGB2GRAY)
             depth = load_file(root / f"ground_truth/frames/{frame.image.stem}.safetensors")["depth"]
             for x, y in np.asarray(cv2.goodFeaturesToTrack(image[60:-60, 60:-60], 60, 0.05, 30)).reshape(-1, 2)[number:] + 60.5:
                 column, row = int(x), int(y)

@@ -163,10 +163,24 @@ def run_facts(folder: Path) -> dict[str, Any]:
         "command": about.get("command"),
         "version": about.get("version"),
         "report": str(page) if page.is_file() else None,
+        "lengths": lengths_of(run / "scaling.json") if any(record.name == "scaling" for record in records) else None,
         "scores": scores_of(run / "evaluation.json"),
         "outdated": [text.format(folder) for stages, text in OUTDATED if stages & old],
         "stages": [{**{name: getattr(record, name) for name in STAGE}, "outdated": record.name in old} for record in records],
     }
+
+
+def lengths_of(path: Path) -> str | None:
+    """What made the run's lengths metres; None: nothing did, or the file cannot be read."""
+    from fieldfuse.errors import InputError
+    from fieldfuse.files import read_json
+    from fieldfuse.poses.scaling import Scaling
+
+    try:
+        facts = Scaling.from_dict(read_json(path)).facts
+    except InputError:
+        return None
+    return None if facts is None else f"in metres: {facts['text']}"
 
 
 def scores_of(path: Path) -> dict[str, dict[str, float]]:

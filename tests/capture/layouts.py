@@ -367,6 +367,7 @@ LAYOUTS: dict[str, tuple[str, Callable[[Path], Pinhole]]] = {
     "bundler": ("bundler", programs.write_bundler),
     "scannetpp": ("scannetpp", programs.write_scannetpp),
     "arkitscenes": ("arkitscenes", programs.write_arkitscenes),
+    "rgbd": ("rgbd", programs.write_rgbd),
 }
 
 

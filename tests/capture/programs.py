@@ -267,3 +267,18 @@ def write_arkitscenes(root: Path) -> Pinhole:
         rows += [words([time + 0.0167 * step, *turn + 1, *shift + 1]) for step in range(1, 6)]
     (root / "lowres_wide.traj").write_text("\n".join(rows) + "\n")
     return c
+
+
+def write_rgbd(root: Path) -> Pinhole:
+    """Folders of no published layout: poses row by row as TUM has them, ORB-SLAM's camera."""
+    c, rows = OFF_CENTRE, []
+    for index, eye in enumerate(eyes()):
+        picture, depth = render(eye, c)
+        save_picture(root / f"raw_imgs/{index:04d}_rgb_raw.png", picture)
+        save_depth(root / f"depth_imgs/{index:04d}_depth_raw.png", depth, 5000.0)
+        rows.append(words([1341841278.8 + index, *eye.centre, *Rotation.from_matrix(eye.rotation().T).as_quat()]))
+    (root / "truth_cam_poses.txt").write_text("\n".join(rows) + "\n")
+    lens = {"fx": c.fx, "fy": c.fy, "cx": c.cx - 0.5, "cy": c.cy - 0.5}
+    lines = [f"Camera.{name}: {value}" for name, value in lens.items()]
+    (root / "TUM3.yaml").write_text("\n".join(["%YAML:1.0", *lines, "DepthMapFactor: 5000.0"]) + "\n")
+    return c

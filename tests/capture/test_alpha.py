@@ -19,7 +19,7 @@ from tests.capture.board import texture
 from tests.capture.layouts import LAYOUTS
 
 # Counts as cut out; JPEG and video hold no alpha.
-OTHERS = ("blender", "polycam", "record3d", "redwood", "replica", "scannet", "scannetpp", "scanner3d", "sens", "stray")
+OTHERS = ("blender", "polycam", "record3d", "redwood", "replica", "rgbd", "scannet", "scannetpp", "scanner3d", "sens", "stray")
 HIDDEN = (255, 0, 255)  # RGB of what alpha takes away
 
 

@@ -38,6 +38,7 @@ FILES = {
     "meshroom": ("MeshroomCache/StructureFromMotion/0a1b/cameras.sfm",),
     "bundler": ("bundle.out", "list.txt"),
     "scannetpp": ("dslr/nerfstudio/transforms_undistorted.json",),
+    "rgbd": ("truth_cam_poses.txt", "TUM3.yaml"),
     "arkitscenes": ("lowres_wide.traj", "lowres_wide_intrinsics/41069021_305.377.pincam"),
 }
 CASES = [(layout, name) for layout, names in FILES.items() for name in names]

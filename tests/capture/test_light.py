@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import sys
 from dataclasses import replace
 from pathlib import Path
@@ -163,6 +164,7 @@ def test_camera_raw_is_developed_alike(tmp_path: Path) -> None:
     capture = check_capture(raw_photos(tmp_path / "a", (1.0, 1.0, 0.25, 1.0)))
     assert {frame.balance for frame in capture.frames} == {(2.0, 1.0, 1.667)} and len({frame.white for frame in capture.frames}) == 1
     assert "4 images are camera raw, developed with one white balance (red 2, blue 1.67 times" in " ".join(capture.warnings)
+    assert capture_from_dict(json.loads(json.dumps(capture_to_dict(capture)))).frames == capture.frames
     white = (capture.frames[0].white or 0) / 65535
     for number, gain in ((0, 1.0), (2, 0.25)):
         assert off(load_image(capture.frames[number])[2:-2, 2:-2], (gain * light(number) / white)[2:-2, 2:-2]) < 2.5

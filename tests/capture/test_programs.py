@@ -107,6 +107,15 @@ def test_metashape_lens(tmp_path: Path, k4: float, pixels: float) -> None:
     assert capture.up is None and not capture.metric
 
 
+def test_lens_as_photoscan_wrote_it(tmp_path: Path) -> None:
+    c = programs.write_metashape(tmp_path)
+    text, lens = (tmp_path / "cameras.xml").read_text(), programs.metashape_calibration(c)
+    old = f"<fx>{c.fx}</fx><fy>{c.fy}</fy><cx>{c.cx}</cx><cy>{c.cy}</cy><skew>0</skew><k1>-0.2</k1><p1>0.004</p1><p2>-0.007</p2>"
+    old = f'<calibration class="adjusted"><resolution width="80" height="60"/>{old}</calibration>'
+    (tmp_path / "cameras.xml").write_text(text.replace(lens, old))
+    assert lens_error(open_capture(tmp_path), c, brown([-0.2], -0.007, 0.004)) < 1e-6
+
+
 def test_metashape_fisheye(tmp_path: Path) -> None:
     write_with(tmp_path, "<k1>-0.04</k1><k2>0.02</k2><k3>-0.01</k3><k4>0.003</k4>", "fisheye")
     assert lens_error(open_capture(tmp_path), programs.OFF_CENTRE, by_angle([-0.04, 0.02, -0.01, 0.003])) < 1e-6

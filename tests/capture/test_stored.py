@@ -51,11 +51,10 @@ def poses(count: int) -> Array:
     return out
 
 
-def found(capture: Capture, cameras: list[Intrinsics]) -> tuple[PoseResult, Capture]:
+def found(capture: Capture, cameras: list[Intrinsics]) -> Capture:
     count = len(capture.frames)
     names = [frame.name for frame in capture.frames]
-    result = PoseResult(SFM, count, count, names, cameras, poses(count), [count], [], np.zeros((1, 3)))
-    return result, result.apply(capture)
+    return PoseResult(SFM, count, count, names, cameras, poses(count), [count], [], np.zeros((1, 3))).apply(capture)
 
 
 def stored_places(orientation: int, places: Array) -> Array:
@@ -80,8 +79,8 @@ def test_cameras_beside_turned_photos_fit_the_files(tmp_path: Path, lens: str, m
         photo(place / "images" / f"{number}.jpg", number, seed=number)
     capture = open_capture(place)
     assert capture.kind == "photos" and not to_convert(capture)
-    result, posed = found(capture, [camera_for(number, lens) for number in orientations])
-    put_cameras(tmp_path / "cameras", result, posed)
+    posed = found(capture, [camera_for(number, lens) for number in orientations])
+    put_cameras(tmp_path / "cameras", posed)
     if model == "transforms":
         shutil.copy(tmp_path / "cameras" / "transforms.json", place)
     else:
@@ -113,8 +112,8 @@ def test_mirrored_photos_are_written_upright_into_the_run(tmp_path: Path) -> Non
         seen, true = load_image(after, exif=True), load_image(before, exif=True)
         assert seen.shape == true.shape and np.abs(seen.astype(int) - true).mean() < 6
     cameras = [camera_for(number) for number in orientations]
-    result, posed = found(turned, cameras)
-    put_cameras(tmp_path / "run", result, posed)
+    posed = found(turned, cameras)
+    put_cameras(tmp_path / "run", posed)
     again = open_capture(tmp_path / "run")
     assert [frame.intrinsics for frame in again.frames] == cameras
     for before, after in zip(posed.frames, again.frames, strict=True):
@@ -125,11 +124,12 @@ def test_given_cameras_are_exported_as_they_came(tmp_path: Path) -> None:
     for number in (1, 3, 6):
         photo(tmp_path / "photos" / f"{number}.jpg", number, seed=number)
     capture = open_capture(tmp_path / "photos")
-    result, posed = found(capture, [camera_for(1)] * 3)
+    posed = found(capture, [camera_for(1)] * 3)
     for kind in ("photos", "transforms"):
-        put_cameras(tmp_path / kind, result, Capture(kind, posed.root, posed.frames))
+        put_cameras(tmp_path / kind, Capture(kind, posed.root, posed.frames))
     shutil.copy(tmp_path / "transforms" / "transforms.json", tmp_path / "photos")
-    for frame, pose in zip(open_capture(tmp_path / "photos").frames, result.world_from_camera, strict=True):
+    for frame, other in zip(open_capture(tmp_path / "photos").frames, posed.frames, strict=True):
+        pose = other.world_from_camera
         np.testing.assert_allclose(invert(frame.world_from_camera) @ pose, np.eye(4), atol=1e-9)
         assert frame.intrinsics == camera_for(1)
 
@@ -147,10 +147,10 @@ def test_cameras_of_a_capture_behind_a_link_name_its_images_from_there(tmp_path:
     place = tmp_path / "photos"
     photo(place / "images" / "1.jpg", 1, seed=1)
     photo(place / "images" / "2.jpg", 1, seed=2)
-    result, posed = found(open_capture(place), [camera_for(1, PINHOLE), camera_for(1, PINHOLE)])
-    put_cameras(place, result, posed)
+    posed = found(open_capture(place), [camera_for(1, PINHOLE), camera_for(1, PINHOLE)])
+    put_cameras(place, posed)
     (tmp_path / "link").symlink_to(place)
     again = open_capture(tmp_path / "link")
     assert again.kind == "transforms"
-    put_cameras(tmp_path / "cameras", result, again)
+    put_cameras(tmp_path / "cameras", again)
     assert '"file_path": "images/1.jpg"' in (tmp_path / "cameras" / "transforms.json").read_text()

@@ -170,6 +170,7 @@ def test_a_source_with_a_place_keeps_it(filmed: tuple[Path, Capture, PoseResult]
     for value in ([47.0, 8.0, 400.0], {"latitude": 47.0, "longitude": 8.0, "altitude": 400.0}):
         found = find_scaling(replace(capture, extra={"reference_lla": value}), result, PosesSettings())
         assert found.georeference is not None and found.georeference.origin.tolist() == [47.0, 8.0, 400.0] and found.move.scale == 1.0
+        assert found.apply(replace(capture, up=None), result)[0].up == (0.0, 0.0, 1.0)
     broken = find_scaling(replace(capture, extra={"reference_lla": ["a", None]}), result, PosesSettings())
     assert broken.georeference is None
 

@@ -7,8 +7,8 @@ cameras' middle.
 
 Lens (user manual, "Camera models"): x = X/Z, y = Y/Z, r² = x² + y²,
 x' = x (1 + k1 r² + k2 r⁴ + k3 r⁶ + k4 r⁸) + p1 (r² + 2x²) + 2 p2 x y, y' likewise with x and y, p1 and p2 exchanged: OpenCV's p2 and p1;
-u = w/2 + cx + x' (f + b1) + y' b2, v = h/2 + cy + y' f. A fisheye's x and y are first scaled to the angle from the axis. A
-spherical sensor's images are panoramas whose middle looks along z.
+u = w/2 + cx + x' (f + b1) + y' b2, v = h/2 + cy + y' f. A fisheye's x and y are first scaled to the angle from the axis. A spherical
+sensor's images are panoramas whose middle looks along z. PhotoScan until 1.2 has fx, fy, skew, cx and cy in pixels, p1 and p2 as OpenCV.
 """
 
 from __future__ import annotations
@@ -173,11 +173,13 @@ def _lens(sensor: Element, calibration: Element, kind: str, where: str, remarks:
     if kind not in ("frame", "fisheye"):
         raise InputError(f"{where}: a camera of type {kind[:40]!r} is not supported; undistort the images in Metashape and export again")
     width, height = _size(sensor, calibration, where)
-    if calibration.find("f") is None:
-        raise InputError(f"{where}: there is no focal length ('f'); export the cameras from Metashape 1.2 or later")
-    f, b1, b2 = value("f"), value("b1"), value("b2")
-    p1, p2 = value("p1"), value("p2")
-    camera = Intrinsics(width, height, f + b1, f, width / 2 + value("cx"), height / 2 + value("cy")).checked(where)
+    old = calibration.find("fx") is not None
+    if calibration.find("f") is None and not old:
+        raise InputError(f"{where}: there is no focal length ('f'); export the cameras again")
+    f, b1, b2 = (value("fy"), value("fx") - value("fy"), value("skew")) if old else (value("f"), value("b1"), value("b2"))
+    p1, p2 = (value("p2"), value("p1")) if old else (value("p1"), value("p2"))
+    middle = (0.0, 0.0) if old else (width / 2, height / 2)
+    camera = Intrinsics(width, height, f + b1, f, middle[0] + value("cx"), middle[1] + value("cy")).checked(where)
     if abs(b2) > SKEWED * f:
         raise InputError(f"{where}: the camera is skewed (b2 is {b2:g}), which is not supported; undistort the images in Metashape first")
     if abs(b2) * height / (2 * f) > SHIFT:

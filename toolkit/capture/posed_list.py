@@ -19,7 +19,7 @@ from fieldfuse.capture.types import Capture, Frame
 
 BESIDE = 0.5  # of an image's side by which a principal point may lie outside: images may have been cropped since
 T = TypeVar("T")
-MOST_FOLDERS = 100
+MOST_FOLDERS = 30  # in which an export is looked for
 FOLDERS = ("", "images", "imgs", "photos", "input")  # where images lie beside the file that lists them, the usual ones first
 
 
@@ -88,7 +88,8 @@ def exported(folder: Path, find: Callable[[Path], T | None]) -> T | None:
 
 def _find(folder: CaptureFiles, names: Sequence[str], source: Path) -> Found:
     """Where most of the names are: in the file's own folder or a usual one beside it or in the root, else anywhere."""
-    base = source.parent.resolve().relative_to(folder.root).as_posix()
+    own = source.parent.resolve()
+    base = own.relative_to(folder.root).as_posix() if own.is_relative_to(folder.root) else "."  # a linked folder
     best: Found | None = None
     for place in dict.fromkeys(posixpath.normpath(posixpath.join(start, name)) for start in (base, ".") for name in FOLDERS):
         if (folder.root / place).is_dir():

@@ -323,14 +323,14 @@ def _aligned(views: Views, view: View, ray: Sights, pixel: Array, depth: float, 
     spacing = np.array([view.camera.width / width, view.camera.height / height])
     cameras, poses, pixels = [view.camera], [view.pose], [pixel]
     points = _faced(view, pixel, offsets, np.array([depth]), 0)[0]
-    stop = (cv2.TERM_CRITERIA_COUNT + cv2.TERM_CRITERIA_EPS, 60, 1e-4)
+    stop, whole = (cv2.TERM_CRITERIA_COUNT + cv2.TERM_CRITERIA_EPS, 60, 1e-4), np.full((side, side), 255, np.uint8)
     for other in others:
         seen = _sampled(views[other].grey[0], views[other].at(points, 0))
         if not np.isfinite(seen).all():
             continue
         template, shown = (values.reshape(side, side).astype(np.float32) for values in (own, seen))
         try:
-            same, warp = cv2.findTransformECC(template, shown, np.eye(2, 3, dtype=np.float32), cv2.MOTION_AFFINE, stop, None, 3)
+            same, warp = cv2.findTransformECC(template, shown, np.eye(2, 3, dtype=np.float32), cv2.MOTION_AFFINE, stop, whole, 3)
         except cv2.error:  # it does not settle
             continue
         centre = warp @ np.array([HALF, HALF, 1.0])

@@ -28,6 +28,7 @@ FAR_OFF = 4.0  # pixels at a long side of 1600 that a corner may be off
 ROBUST = 1.0  # pixels from which on residuals weigh less
 DETECTED_TO = 0.1  # pixels, at least, to which corners are taken to be detected
 EDGE_REACH = 0.07  # times a marker's side that edges are looked for on either side: about half a module
+EDGE_LEAST, EDGE_MOST = 2.0, 12.0  # pixels of that
 EDGE_STEP = 0.25  # pixels
 EDGE_PART = (0.12, 0.88)  # of an edge that is looked at: corners are round
 LEAST_CONTRAST = 0.03  # linear light from black to white
@@ -56,12 +57,11 @@ class Detector:
         how = cv2.aruco.DetectorParameters()
         self.board = None
         if marker.squares is not None:
-            try:
-                self.board = cv2.aruco.CharucoBoard(marker.squares, marker.square, marker.side, dictionary)
-                self._charuco = cv2.aruco.CharucoDetector(self.board, cv2.aruco.CharucoParameters(), how)
-            except cv2.error as error:
-                size = f"{marker.squares[0]}x{marker.squares[1]}"
-                raise InputError(f"marker: {marker.dictionary} has too few markers for a board of {size}; name the board's own") from error
+            columns, rows = marker.squares
+            if columns * rows // 2 > len(dictionary.bytesList):
+                raise InputError(f"marker: {marker.dictionary} has too few markers for a board of {columns}x{rows}; name the board's own")
+            self.board = cv2.aruco.CharucoBoard(marker.squares, marker.square, marker.side, dictionary)
+            self._charuco = cv2.aruco.CharucoDetector(self.board, cv2.aruco.CharucoParameters(), how)
         else:
             self._aruco = cv2.aruco.ArucoDetector(dictionary, how)
 
@@ -76,11 +76,11 @@ class Detector:
             if numbers is None or len(numbers) == 0:
                 return {}
             return {BOARD: (np.asarray(numbers).ravel(), np.asarray(found, dtype=np.float64).reshape(-1, 2) + 0.5)}
-        found, numbers, _ = self._aruco.detectMarkers(grey)
+        outlines, numbers, _ = self._aruco.detectMarkers(grey)
         if numbers is None:
             return {}
         seen: dict[int, list[Any]] = defaultdict(list)
-        for number, corner in zip(np.asarray(numbers).ravel(), found, strict=True):
+        for number, corner in zip(np.asarray(numbers).ravel(), outlines, strict=True):
             seen[int(number)].append(refined(grey, np.asarray(corner, dtype=np.float64).reshape(4, 2)) + 0.5)
         # Of a marker that an image shows twice nothing says which is which.
         return {number: (np.arange(4), places[0]) for number, places in seen.items() if len(places) == 1}
@@ -100,20 +100,28 @@ def refined(grey: Array, corners: Array) -> Array:
     An edge lies where light, not its sRGB value, is half way from black to white: a lens and a pixel take means of light. By sRGB values
     a black square of 40 pixels comes out half a pixel too small.
     """
+    rim = int(MOST_MOVED + EDGE_MOST + 2)
+    left, top = np.maximum(np.floor(corners.min(axis=0)).astype(int) - rim, 0)
+    right, bottom = np.ceil(corners.max(axis=0)).astype(int) + rim + 1
+    light, origin = linear_light(grey[top:bottom, left:right]).astype(np.float32), np.array([left, top])
     lines = []
     for first, second in zip(corners, np.roll(corners, -1, axis=0), strict=True):
         along, length = second - first, float(np.linalg.norm(second - first))
         outward = np.array([along[1], -along[0]]) / max(length, 1e-9)
         outward *= np.sign((first - corners.mean(axis=0)) @ outward) or 1.0
-        reach = float(np.clip(EDGE_REACH * length, 2.0, 12.0))
+        reach = float(np.clip(EDGE_REACH * length, EDGE_LEAST, EDGE_MOST))
         at, steps = np.linspace(*EDGE_PART, max(8, round(length))), np.arange(-reach, reach + 1e-9, EDGE_STEP)
-        places = first + at[:, None, None] * along + steps[None, :, None] * outward
-        shown = cv2.remap(grey, *np.moveaxis(places.astype(np.float32), -1, 0), cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
-        profile, quarter = linear_light(shown), len(steps) // 4
-        dark, bright = np.median(profile[:, :quarter], axis=1), np.median(profile[:, -quarter:], axis=1)
-        share = np.clip((bright[:, None] - profile) / np.maximum(bright - dark, 1e-6)[:, None], 0, 1)
-        edge = steps[0] + EDGE_STEP * (share.sum(axis=1) - 0.5)  # as much dark as lies inside of it
-        fine = (bright - dark > LEAST_CONTRAST) & (np.abs(edge) < reach - 0.5)
+        across, down = np.moveaxis(first - origin + at[:, None, None] * along + steps[None, :, None] * outward, -1, 0).astype(np.float32)
+        profile = cv2.remap(light, across, down, cv2.INTER_LINEAR, borderMode=cv2.BORDER_REPLICATE)
+        half = len(steps) // 2
+        # The darkest within and the brightest without: farther off the marker's bits, and what it lies on, begin to shine in.
+        dark, bright = profile[:, : half + 1].min(axis=1), profile[:, half:].max(axis=1)
+        above = (profile > (0.5 * (dark + bright))[:, None]) & (np.arange(len(steps)) > profile[:, : half + 1].argmin(axis=1)[:, None])
+        right_of = np.clip(above.argmax(axis=1), 1, None)
+        rows = np.arange(len(at))
+        low, high = profile[rows, right_of - 1], profile[rows, right_of]
+        edge = steps[right_of] - EDGE_STEP * (high - 0.5 * (dark + bright)) / np.maximum(high - low, 1e-6)
+        fine = above.any(axis=1) & (bright - dark > LEAST_CONTRAST) & (np.abs(edge) < reach - 0.25)
         points = first + at[:, None] * along + edge[:, None] * outward
         for _ in range(3):
             if fine.sum() < 4:

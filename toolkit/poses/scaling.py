@@ -85,7 +85,11 @@ class Scaling:
             scaling=self.facts,
             warnings=[*poses.warnings, *self.warnings],
         )
-        return (capture if self.move.scale == 1.0 else rescaled(capture, self.move.scale, moved.metric)), moved
+        capture = capture if self.move.scale == 1.0 else rescaled(capture, self.move.scale, moved.metric)
+        if self.georeference is not None and poses.source != SFM and capture.up is None:
+            east, north, up = (float(value) for value in self.georeference.enu_from_input.rotation[2])
+            capture = replace(capture, up=(east, north, up))
+        return capture, moved
 
 
 def rescaled(capture: Capture, factor: float, metric: bool) -> Capture:

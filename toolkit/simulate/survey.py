@@ -23,6 +23,7 @@ from fieldfuse.simulate.scene import Scene
 from fieldfuse.simulate.solids import BOX, Solid, Solids
 
 THICK = 0.002  # metres: of the plate that a marker is printed on
+PAPER = (0.7, 0.7, 0.7)  # of light that it reflects: white, and not blown out under the lamps
 TEXELS = 512  # about so many on a plate's side
 GPS_FOLDER = 0x8825
 FINE = 10**6  # seconds of arc are written in such parts: 0.03 mm
@@ -53,12 +54,12 @@ def with_markers(scene: Scene, markers: list[MarkerSettings]) -> Scene:
     Raises:
         InputError: a dictionary has no such marker.
     """
-    textures, materials, solids = [], list(scene.materials.items), list(scene.solids.items)
+    textures, materials, solids = list[Array](), list(scene.materials.items), list(scene.solids.items)
     for marker in markers:
         image, share = marker_image(marker)
         width = marker.side / share
         white = len(materials)
-        materials += [Material(), Material(scene.bank.count + len(textures), width, (0.5, 0.5))]
+        materials += [Material(tint=PAPER), Material(scene.bank.count + len(textures), width, (0.5, 0.5), PAPER)]
         textures.append(image)
         half = np.array([width / 2, width / 2, THICK / 2])
         axes = _axes(np.array([0.0, 0.0, 1.0] if marker.facing is None else marker.facing), marker.turn)

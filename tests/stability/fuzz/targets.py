@@ -117,6 +117,7 @@ FILES = {
     "meshroom": ("MeshroomCache/StructureFromMotion/0a1b/cameras.sfm",),
     "bundler": ("bundle.out", "list.txt"),
     "scannetpp": ("dslr/nerfstudio/transforms_undistorted.json", "dslr/train_test_lists.json"),
+    "rgbd": ("truth_cam_poses.txt", "TUM3.yaml", "depth_imgs/0001_depth_raw.png"),
     "arkitscenes": ("lowres_wide.traj", "lowres_wide_intrinsics/41069021_305.377.pincam", "lowres_depth/41069021_305.477.png"),
 }
 
