@@ -18,7 +18,7 @@ from fieldfuse.capture.types import MODEL_NAMES, Capture
 from fieldfuse.capture.unpack import folder_around
 from fieldfuse.errors import InputError
 from fieldfuse.export.cameras import write_cameras
-from fieldfuse.export.crop import LEAST_INSIDE, LEAST_KEPT, cleaned, cropped, kept_share, region_of
+from fieldfuse.export.crop import LEAST_INSIDE, LEAST_KEPT, cleaned, cropped, kept_share, region_of, seen_part
 from fieldfuse.export.extras import require
 from fieldfuse.export.georeference import write_georeference
 from fieldfuse.export.sparse import colours_in, points_of_field, stored_points
@@ -171,16 +171,19 @@ def export_field(job: Job, ready: Prepared, fitted: Fitted, wish: Wish) -> Expor
             except InputError as error:
                 undone, out.whole = undone | {UNDISTORTED}, False
                 notes.append(f"undistorted images were left out: {error}")
+    shown = fitted.field
+    if formats & {PAGE, "video"}:
+        shown = seen_part(shown, ready.training.intrinsics, ready.training.world_from_camera, job.progress)
     if PAGE in formats:
         try:
-            out.files.append(put_page(job, folder / NAME, fitted.field, views, scene))
+            out.files.append(put_page(job, folder / NAME, shown, views, scene))
         except InputError as error:
             undone.add(PAGE)
             notes.append(f"the page to walk through was left out: {error}")
     if "video" in formats:
         _, lenses, around = orbit_cameras(views, scene, job.settings.export.video_frames)
         job.progress.update(0, len(around), "orbit video")
-        camera = camera_of(job, fitted.field, views, scene, baked=False)
+        camera = camera_of(job, shown, views, scene, baked=False)
         lenses = [at_most(lens, VIDEO_SIDE) for lens in lenses]
         require_pictures(lenses, kept=False, advice="leave video out of export.formats")
         write_video(folder / "orbit.mp4", pictures(camera, lenses, around, job.progress), FPS)

@@ -98,6 +98,9 @@ def baked_of(job: Job, field: Field, views: Views, scene: Scene) -> BakedField:
 def put_page(job: Job, path: Path, field: Field, views: Views, scene: Scene) -> Path:
     """The baked field as a page that any browser walks through, with the places of all images (not the images) and a flight.
 
+    Args:
+        field: without what no training view sees (`crop.seen_part`).
+
     Raises:
         InputError: a decoder that cannot be baked, or is too wide for a page.
         OutputError: the file cannot be written.
@@ -107,7 +110,7 @@ def put_page(job: Job, path: Path, field: Field, views: Views, scene: Scene) -> 
 
     require_page(field)
     _, _, around = orbit_cameras(views, scene, FLIGHT)
-    bytes_ = baked(job, field, views)
+    bytes_ = baked(job, field, views, seen=0.0)
     tour = Tour(
         *(views.names, views.intrinsics, views.world_from_camera, views.test),
         path=around,

@@ -46,8 +46,8 @@ def load(
         source: a video, a folder of images, or a capture of any known layout.
         workdir: where frames of a video and structure from motion's database go; None: a temporary folder that goes with the scene.
         progress: called with stage, done, total and a remark, and asks to stop by returning False; or True for a bar on the terminal.
-        options: `image_size`, `holdout`, `poses` ("auto", "given", "sfm"), `effects` ("auto", "off"), `seed`, `threads`, `preset`, …, and
-            `settings` for those with full names.
+        options: `image_size`, `holdout`, `poses` ("auto", "given", "sfm"), `effects` ("auto", "off"), `seed`, `threads`, `preset`, `scale`,
+            `marker`, `depth_scale` (docs/scale.md), …, and `settings` for those with full names.
 
     Raises:
         InputError: the source or a setting is not usable.

@@ -128,7 +128,8 @@ def test_given_cameras_are_exported_as_they_came(tmp_path: Path) -> None:
     for kind in ("photos", "transforms"):
         put_cameras(tmp_path / kind, Capture(kind, posed.root, posed.frames))
     shutil.copy(tmp_path / "transforms" / "transforms.json", tmp_path / "photos")
-    for frame, pose in zip(open_capture(tmp_path / "photos").frames, result.world_from_camera, strict=True):
+    for frame, other in zip(open_capture(tmp_path / "photos").frames, posed.frames, strict=True):
+        pose = other.world_from_camera
         np.testing.assert_allclose(invert(frame.world_from_camera) @ pose, np.eye(4), atol=1e-9)
         assert frame.intrinsics == camera_for(1)
 

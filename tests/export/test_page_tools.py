@@ -11,6 +11,7 @@ import torch
 from scipy.spatial.transform import Rotation
 
 from fieldfuse.camera import Array, Intrinsics, Similarity, project
+from fieldfuse.config import crop_box
 from fieldfuse.export.page import write_page
 from fieldfuse.nerfusion.decoder import make_decoder
 from fieldfuse.pipelines.render_path import path_fps, read_cameras
@@ -72,7 +73,12 @@ def page(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 @pytest.fixture
 def open_page(browser: Driven, page: Path) -> Driven:
-    opened(browser, page, *WINDOW)
+    """As it opens: loaded again only where a test left it."""
+    if browser.run("location.href") == page.as_uri() and not browser.run("window.drawn"):
+        browser.run("fieldfuse.tools.open(null), fieldfuse.tools.points = [], fieldfuse.to(2)")
+        until(lambda: browser.run("!fieldfuse.walker.journey"))
+    else:
+        opened(browser, page, *WINDOW)
     return browser
 
 
@@ -125,7 +131,8 @@ def test_a_crop_is_the_box_of_its_numbers(shell: float, browser: Driven, page: P
         for side, value in enumerate((low[axis], high[axis])):
             browser.run(f"(i => {{ i.value = {value:.4f}; i.onchange({{target: i}}); }})(document.getElementById('{name}{side}'))")
     text = str(browser.run("document.getElementById('numbers').textContent"))
-    assert text.startswith('--crop "') and np.allclose(np.array(text[8:-1].split(","), float), np.append(low, high), atol=1e-4)
+    box = crop_box(text.removeprefix('--crop "').removesuffix('"'))
+    assert box is not None and np.allclose(box, [low, high], atol=1e-4)
     turn, place = FRAME.rotation.T / FRAME.scale, FRAME.inverse()
     above = poses()[3]
     for x, y in ((400, 300), (350, 330), (475, 250), (440, 330)):

@@ -23,7 +23,7 @@ from fieldfuse.export.surface import at_most, spread
 from fieldfuse.poses.region import OBJECT, Region
 from fieldfuse.poses.scene import Scene
 from fieldfuse.progress import SILENT, Progress
-from fieldfuse.render.bake import SEEN
+from fieldfuse.render.bake import SEEN, seen_voxels
 from fieldfuse.render.composite import STOP
 from fieldfuse.render.field import Field
 from fieldfuse.render.image import make_renderer, render_view
@@ -116,6 +116,18 @@ def cleaned(field: Field, intrinsics: Sequence[Intrinsics], world_from_camera: A
     stays = np.zeros(len(solid), bool)
     stays[solid] = good[label[solid]]
     return _with(field, torch.from_numpy(stays).to(field.device))
+
+
+def seen_part(field: Field, intrinsics: Sequence[Intrinsics], world_from_camera: Array, progress: Progress = SILENT) -> Field:
+    """The field without what pages leave out, since no camera sees it (`bake.seen_voxels`): rays through it take a fifth less time.
+
+    Args:
+        intrinsics, world_from_camera: pinhole cameras, (N, 4, 4), working frame; of the training views.
+
+    Raises:
+        Interrupted: the user asked to stop.
+    """
+    return _with(field, seen_voxels(field.to("cpu"), intrinsics, world_from_camera, progress=progress).to(field.device))
 
 
 def kept_share(field: Field, part: Field, region: Region | None, views: Views) -> tuple[float, float]:
