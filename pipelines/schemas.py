@@ -133,11 +133,11 @@ def checked(value: Any, form: Any, path: Path) -> Any:
 
 
 def read_export_facts(path: Path) -> dict[str, Any]:
-    """`exports/facts.json`; earlier versions wrote one note, or none.
+    """`exports/facts.json`; earlier versions wrote one note, or none, and no part.
 
     Raises:
         InputError: it cannot be read, or it has another form.
     """
     facts: dict[str, Any] = read_checked(path, ExportFacts)
     note = facts.pop("note", None)
-    return {"notes": [] if note is None else [note], **facts}
+    return {"notes": [] if note is None else [note], "part": "off", **facts}

@@ -58,7 +58,7 @@ def test_a_damaged_file_is_refused_in_a_sentence(text: str, tmp_path: Path) -> N
 def test_facts_of_exports_of_earlier_versions_are_read(told: dict[str, Any], notes: list[str], tmp_path: Path) -> None:
     """They had one note or none, and were called damaged."""
     (tmp_path / "facts.json").write_text(json.dumps({"mesh": None, **told}))
-    assert schemas.read_export_facts(tmp_path / "facts.json") == {"mesh": None, "notes": notes}
+    assert schemas.read_export_facts(tmp_path / "facts.json") == {"mesh": None, "notes": notes, "part": "off"}
 
 
 def test_what_the_stages_write_has_the_forms(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:

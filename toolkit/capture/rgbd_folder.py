@@ -118,7 +118,7 @@ def _unposed(
     frames = []
     for index, (image, name) in enumerate(zip(images, unique_names(images), strict=True)):
         posed = posed_frame(name, image, camera, np.eye(4), str(image), depths.get(index))
-        frames.append(replace(posed, world_from_camera=None))
+        frames.append(replace(posed, world_from_camera=None, focal_prior=camera.fx))
     places = f"{layout.colour.relative_to(root)}/, {layout.depth.relative_to(root)}/ and {source}"
     remarks = [f"read as RGB-D from {places}; there is no list of poses, and they are found from the images"]
     capture = assemble("rgbd", root, frames, remarks, metric=True, depth_scale=scale or 1.0, alpha=False)
