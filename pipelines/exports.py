@@ -199,9 +199,12 @@ def export_field(job: Job, ready: Prepared, fitted: Fitted, wish: Wish, splats: 
     if isinstance(splats, str):
         undone |= formats & set(SPLAT_FILES)
         notes.append(splats)
-    elif splats is not None and SPZ in formats:
-        save_splats(folder / SPLAT_FILES[SPZ], splats)
-        out.files.append(folder / SPLAT_FILES[SPZ])
+    elif splats is not None:
+        if region is not None or job.settings.export.clean:
+            notes.append("splats are of the whole field: they are neither cropped nor cleaned")
+        if SPZ in formats:
+            save_splats(folder / SPLAT_FILES[SPZ], splats)
+            out.files.append(folder / SPLAT_FILES[SPZ])
     out.made = formats - undone
     return out
 
