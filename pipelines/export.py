@@ -1,4 +1,4 @@
-"""`fieldfuse export`: points, meshes, cameras and an orbit video from a run's field."""
+"""`fieldfuse export`: points, meshes, splats, cameras and an orbit video from a run's field."""
 
 from __future__ import annotations
 

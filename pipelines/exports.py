@@ -6,7 +6,7 @@ from collections.abc import Iterable
 from dataclasses import asdict, dataclass, field, replace
 from functools import partial
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -31,11 +31,15 @@ from fieldfuse.pipelines.job import Job
 from fieldfuse.pipelines.pictures import NAME, PAGE, camera_of, orbit_cameras, pictures, put_page
 from fieldfuse.pipelines.prepare import Prepared
 from fieldfuse.pipelines.schemas import read_export_facts
+from fieldfuse.pipelines.splats import SPLAT_FILES, SPZ, remove_old_splats, splats_or_why_not
 from fieldfuse.pipelines.stages import CollectingStage
 from fieldfuse.pipelines.surfaces import in_input, put_cloud, put_points
 from fieldfuse.pipelines.textured import TEXTURED, put_textured
 from fieldfuse.poses.region import Region
 from fieldfuse.tone import exposed
+
+if TYPE_CHECKING:
+    from fieldfuse.render.splats import Splats
 
 MESHES = ("ply", "obj", "glb")  # as `export.formats` has them
 TEXTURE = "texture"
@@ -93,12 +97,14 @@ def export_results(job: Job, ready: Prepared, fitted: Fitted, wish: Wish) -> dic
     old, exported = job.stages.record("export"), Exported({})
     part = job.settings.export.crop + (", cleaned" if job.settings.export.clean else "")
     same_part = not path.is_file() or read_export_facts(path)["part"] == part
+    formats = job.settings.export.formats if wish.formats is None else wish.formats
+    splats = splats_or_why_not(job, ready, fitted, formats) if "export" not in job.stages.trusted else None
 
     def make() -> dict[str, Any]:
         nonlocal exported
         fits = job.stages.usable("export") and same_part
         before = read_export_facts(path) if fits else None
-        exported = export_field(job, ready, fitted, wish)
+        exported = export_field(job, ready, fitted, wish, splats)
         stage.whole, facts = exported.whole, {**exported.facts, "part": part}
         if wish.alone and not exported.made:
             raise InputError(f"nothing was exported: {'; '.join(facts['notes'])}")
@@ -106,7 +112,8 @@ def export_results(job: Job, ready: Prepared, fitted: Fitted, wish: Wish) -> dic
             facts["mesh"] = before["mesh"]
         if old is not None and not fits:
             made = {file.relative_to(job.folder.path).as_posix() for file in exported.files}
-            gone = sorted({Path(name).name for name in set(old.outputs) - made if name.startswith("exports/")} - {path.name})
+            earlier = {Path(name).name for name in set(old.outputs) - made if name.startswith("exports/")} - {path.name}
+            gone = sorted(earlier | (remove_old_splats(job) if splats is None else set()))
             of = "an earlier field" if same_part else "another crop"
             facts["notes"] += [REMOVED.format(of, ", ".join(gone), job.folder.path)] if gone else []
         return facts
@@ -129,9 +136,10 @@ def export_results(job: Job, ready: Prepared, fitted: Fitted, wish: Wish) -> dic
     return job.run(stage)
 
 
-def export_field(job: Job, ready: Prepared, fitted: Fitted, wish: Wish) -> Exported:
-    """What this command or the settings' `export.formats` name, in the input's frame."""
+def export_field(job: Job, ready: Prepared, fitted: Fitted, wish: Wish, splats: Splats | str | None) -> Exported:
+    """What this command or the settings' `export.formats` name, in the input's frame; `splats`: those of the run, or why there are none."""
     from fieldfuse.export.video import write_video
+    from fieldfuse.render.splat_files import save_splats
 
     views, scene, folder = ready.views, ready.scene, job.folder / "exports"
     formats = set(job.settings.export.formats if wish.formats is None else wish.formats)
@@ -188,6 +196,12 @@ def export_field(job: Job, ready: Prepared, fitted: Fitted, wish: Wish) -> Expor
         require_pictures(lenses, kept=False, advice="leave video out of export.formats")
         write_video(folder / "orbit.mp4", pictures(camera, lenses, around, job.progress), FPS)
         out.files.append(folder / "orbit.mp4")
+    if isinstance(splats, str):
+        undone |= formats & set(SPLAT_FILES)
+        notes.append(splats)
+    elif splats is not None and SPZ in formats:
+        save_splats(folder / SPLAT_FILES[SPZ], splats)
+        out.files.append(folder / SPLAT_FILES[SPZ])
     out.made = formats - undone
     return out
 

@@ -324,7 +324,7 @@ def score_pictures(job: Job, ready: Prepared, pictures: dict[str, Pictures]) -> 
             make=make,
             save=save,
             load=partial(read_checked, path, EVALUATION),
-            inputs=["views", *job.stages.done("tsdf", "render", "direct")],
+            inputs=["views", *job.stages.done("tsdf", "render", "direct", "splats_render")],
             settings=sorted(pictures),
             version=2,
         )

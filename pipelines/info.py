@@ -21,6 +21,7 @@ OUTDATED = (
     ({"field"}, "the field is of earlier pictures or poses; `fieldfuse finetune {}` fits it to those that are there now"),
     ({"tsdf", "tsdf_texture"}, "the TSDF surface is of earlier pictures or poses; `fieldfuse tsdf {}` renews it"),
     ({"render", "evaluate"}, "scores, pictures and the report are of an earlier field or surface; `fieldfuse evaluate {}` renews them"),
+    ({"splats", "splats_render"}, "the splats are of an earlier field; `fieldfuse export {} --formats splat` renews them"),
     ({"export"}, "the exports are of an earlier field; `fieldfuse export {}` renews them"),
 )
 LENGTHS = {True: "in metres", False: "without a unit; --scale, --marker, or the images' GPS give metres"}

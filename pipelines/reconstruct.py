@@ -16,6 +16,7 @@ from fieldfuse.pipelines.fields import (
 )
 from fieldfuse.pipelines.job import Job
 from fieldfuse.pipelines.prepare import Prepared, choose_frames, find_camera_poses, find_capture, find_scaling, prepare
+from fieldfuse.pipelines.splats import SPLATS, make_splats, render_splats
 from fieldfuse.pipelines.summary import Results, put_report, summarise_poses
 from fieldfuse.pipelines.surfaces import fuse_tsdf, match_images
 from fieldfuse.pipelines.textured import TSDF_TEXTURE, texture_tsdf
@@ -82,6 +83,9 @@ def reconstruct(job: Job, goals: frozenset[str], go_on: bool, formats: list[str]
             if plan is not None:
                 plan.choose_exports(job)
             results.exported = export_results(job, ready, fitted, Wish(formats, goals == {"export"}))
+        if stages.usable(SPLATS):
+            stages.trusted.add(SPLATS)
+            results.pictures["splats"] = render_splats(job, ready, make_splats(job, ready, fitted))
     results.scores = score_pictures(job, ready, results.pictures)
     return put_report(job, ready, results, time.monotonic() - start)
 

@@ -30,6 +30,7 @@ from fieldfuse.pipelines.prepare import EFFECTS_FILE, Prepared
 from fieldfuse.pipelines.rendered import Pictures, depth_step
 from fieldfuse.pipelines.schemas import Effects, read_checked
 from fieldfuse.pipelines.source import describe_capture
+from fieldfuse.pipelines.splats import SPLATS
 from fieldfuse.pipelines.textured import TSDF_TEXTURE
 from fieldfuse.pipelines.total_budget import TotalBudget
 from fieldfuse.poses.result import PoseResult
@@ -53,7 +54,7 @@ SEES = {
     "full": "colours depend on the direction of view",
 }
 POSES = ("source", "registered", "total", "models", "missing", "seconds", "agreement", "metric", "scaling")
-OPENED = {".html", ".ply", ".obj", ".glb", ".usdz", ".las", ".laz", ".e57", ".mp4", ".txt", ".json"}
+OPENED = {".html", ".ply", ".spz", ".obj", ".glb", ".usdz", ".las", ".laz", ".e57", ".mp4", ".txt", ".json"}
 NO_TEST_VIEWS = "no image was held out, so there are no scores; give --holdout 8 to keep every 8th image for testing"
 
 
@@ -133,7 +134,7 @@ def describe_field(fitted: Fitted) -> dict[str, Any]:
 
 def exported_files(job: Job) -> list[dict[str, Any]]:
     """Files that other programs can open, as they stand in the records of the stages."""
-    records = [job.stages.records[name] for name in job.stages.done("tsdf", TSDF_TEXTURE, "export")]
+    records = [job.stages.records[name] for name in job.stages.done("tsdf", TSDF_TEXTURE, SPLATS, "export")]
     return [
         {"path": path, "bytes": size}
         for record in records
@@ -176,7 +177,7 @@ def put_report(job: Job, ready: Prepared, results: Results, seconds: float) -> d
         },
         "field": None if fitted is None else describe_field(fitted),
         "notes": notes,
-        "evaluation": {name: scores.get(name) for name in ("field", "tsdf", *(["network"] if "network" in scores else []))},
+        "evaluation": {name: scores.get(name) for name in ("field", "tsdf", *(name for name in ("network", "splats") if name in scores))},
         "baseline": scores.get("nearest_image"),
         "timeline": [] if fitted is None else fitted.timeline,
         "exports": exported_files(job),

@@ -187,3 +187,17 @@ def test_importing_loads_nothing_heavy_and_all_names_are_there() -> None:
     shown = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True).stdout
     assert shown.startswith("[] ") and {*ff.__all__} <= {*shown.split()}
     assert all(getattr(ff, name).__doc__ for name in ff.__all__)
+
+
+def test_splats_show_what_the_field_shows(scene: ff.Scene, fitted: ff.Field, tmp_path: Path) -> None:
+    with steady():
+        splats = fitted.to_splats(splat_seconds=1)
+    ours, theirs = ff.evaluate(splats, scene), ff.evaluate(fitted, scene)
+    assert ours.psnr is not None and theirs.psnr is not None and ours.psnr > theirs.psnr - 4  # of coarse voxels
+    camera = scene.test.cameras[0]
+    shown, depth = splats.render(camera), shoot(circle(12)[0])[1]
+    assert np.median(np.abs(shown.depth - depth)) < 0.1 and np.median(shown.opacity) > 0.95
+    for name, most in (("a.ply", 0), ("a.spz", 4)):
+        splats.save(tmp_path / name)
+        again = ff.Splats.open(tmp_path / name)
+        assert len(again) == len(splats) and mean_error(again.render(camera).rgb, shown.rgb.astype(float)) <= most

@@ -9,7 +9,7 @@ __version__ = "0.2.0"
 if TYPE_CHECKING:
     from fieldfuse.api import evaluate, fit, fuse_tsdf, infer, load
     from fieldfuse.errors import FieldfuseError, InputError, Interrupted, OutputError, PoseError
-    from fieldfuse.results import Camera, Field, Mesh, Points, Render, Scene, Scores, Surface
+    from fieldfuse.results import Camera, Field, Mesh, Points, Render, Scene, Scores, Splats, Surface
 
 _FUNCTIONS = ("evaluate", "fit", "fuse_tsdf", "infer", "load")
 _ERRORS = ("FieldfuseError", "InputError", "Interrupted", "OutputError", "PoseError")
@@ -26,6 +26,7 @@ __all__ = [
     "Render",
     "Scene",
     "Scores",
+    "Splats",
     "Surface",
     "evaluate",
     "fit",

@@ -28,7 +28,20 @@ import numpy as np
 from fieldfuse import steps
 from fieldfuse.config import Settings
 from fieldfuse.errors import InputError
-from fieldfuse.results import OF_FIT, OF_SURFACE, Field, Listener, Scene, Scores, Surface, changed_settings, chosen_settings, listening
+from fieldfuse.results import (
+    OF_FIT,
+    OF_SURFACE,
+    Field,
+    Listener,
+    Scene,
+    Scores,
+    Splats,
+    Surface,
+    changed_settings,
+    chosen_settings,
+    listening,
+)
+from fieldfuse.tone import exposed, unexposed
 
 log = logging.getLogger("fieldfuse")
 
@@ -177,8 +190,9 @@ def fuse_tsdf(scene: Scene, *, depth_from: str = "auto", progress: Listener = No
     return Surface(volume, scene.working_from_input, views.exposure, settings.export.smooth)
 
 
-def evaluate(result: Field | Surface, scene: Scene, *, progress: Listener = None) -> Scores:
-    """Scores of a field or surface at the scene's test views.
+def evaluate(result: Field | Surface | Splats, scene: Scene, *, progress: Listener = None) -> Scores:
+    """Scores of a field, surface or splats at the scene's test views. Splats are in the scene's own frame; what they do not cover is the
+    background of its images, where that is known.
 
     Raises:
         Interrupted: the listener asked to stop.
@@ -186,6 +200,9 @@ def evaluate(result: Field | Surface, scene: Scene, *, progress: Listener = None
     from fieldfuse.evaluation.score import nearest_image_scores, score_views
 
     listener, views, indices = listening(progress, "evaluate"), scene.views, np.flatnonzero(scene.views.test)
+    if isinstance(result, Splats) and views.background is not None:
+        red, green, blue = exposed(np.round(255 * np.array(views.background)).astype(np.uint8), views.exposure).tolist()
+        result = replace(result, background=(red, green, blue))
     onto = result.working_from_input.after(scene.working_from_input.inverse())  # the same, unless it was made from another scene
 
     def shown() -> Iterator[Any]:
@@ -193,6 +210,8 @@ def evaluate(result: Field | Surface, scene: Scene, *, progress: Listener = None
             listener.check()
             listener.update(count, len(indices), views.names[index])
             made = result.working(views.intrinsics[index], onto.poses(views.world_from_camera[index]))
+            if isinstance(result, Splats):
+                made = replace(made, rgb=unexposed(made.rgb, views.exposure))
             yield made if onto.scale == 1 else replace(made, depth=made.depth / onto.scale)
 
     scores = score_views(shown(), views, indices)

@@ -372,8 +372,9 @@ class TsdfSettings:
 # Files for other programs: "texture" is a mesh with one (textured.glb), "page" the field itself for any browser (field.html), the others
 # are named as they end, or as what they hold.
 DEFAULT_EXPORTS = ("points", "ply", "obj", "glb", "texture", "page", "cameras", "video")
-# Made when they are named: points as LAS, LAZ or E57, the textured mesh as USDZ (these need extras), pinhole images with cameras.
-MORE_EXPORTS: tuple[str, ...] = ("las", "laz", "e57", "usdz", "undistorted")
+# Made when they are named: points as LAS, LAZ or E57, the textured mesh as USDZ (these need extras), pinhole images with cameras,
+# Gaussian splats.
+MORE_EXPORTS: tuple[str, ...] = ("las", "laz", "e57", "usdz", "undistorted", "splat", "spz")
 EXPORTS: tuple[str, ...] = (*DEFAULT_EXPORTS, *MORE_EXPORTS)
 
 
@@ -411,6 +412,9 @@ class ExportSettings:
     smooth: Annotated[int, Field(ge=0, le=100)] = 2
     texture_size: Positive = 1280  # long side in pixels, at most, of the pictures that a texture is made of
     video_frames: NotNegative = 90
+    splats: Positive = 150_000  # Gaussians at most, of voxels that training views see
+    sh_degree: Annotated[int, Field(ge=0, le=3)] = 1  # of the spherical harmonics of their colours
+    splat_seconds: Annotated[float, Field(ge=0, lt=10**9)] = 30.0  # of steps on the training images; 0: none
     # What is exported of the field. off: all | box: what lies in the region of interest | hull: what half of the cameras see of that
     # | auto: the box where the cameras look at an object, else all | x0,y0,z0,x1,y1,z1: a box in the frame of the input
     crop: Annotated[str, BeforeValidator(_check_crop)] = "off"

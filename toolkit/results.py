@@ -24,6 +24,7 @@ if TYPE_CHECKING:
     from fieldfuse.poses.result import PoseResult
     from fieldfuse.poses.scene import Scene as Geometry
     from fieldfuse.render.field import Field as SparseField
+    from fieldfuse.render.splats import Splats as Gaussians
     from fieldfuse.tsdf.volume import TsdfVolume
 
 Listener = Progress | Callable[[str, float, float, str], "bool | None"] | bool | None
@@ -285,6 +286,24 @@ class Field(Renderable):
         """The mesh of `to_surface`."""
         return self.to_surface(progress, **options).mesh
 
+    def to_splats(self, progress: Listener = None, **options: Any) -> Splats:
+        """Gaussian splats that show what the field shows, fitted to the training images; options are those of `export` (`splats`,
+        `sh_degree`, `splat_seconds`).
+
+        Raises:
+            InputError: it was opened without its scene, or has another decoder than the deferred one.
+            Interrupted: the listener asked to stop before the first step.
+        """
+        from fieldfuse.training.splats import SplatSettings, splats_of_field
+
+        if self.scene is None:
+            raise InputError("splats are fitted to the training images, and this field has no scene; use Field.open(path, scene)")
+        scene = self.scene
+        chosen = changed_settings(scene.settings, {f"export.{name}": value for name, value in options.items()}, OF_SURFACE)
+        export, listener = chosen.export, listening(progress, "splats")
+        settings = SplatSettings(export.splats, export.sh_degree, export.splat_seconds, chosen.seed)
+        return Splats(splats_of_field(self.sparse, scene.views, self.working_from_input, settings, listener))
+
     def cropped(self, region: str = "auto") -> Field:
         """The part in a region, as the setting `export.crop` has it: "box", "hull", "auto", or "x0,y0,z0,x1,y1,z1" in the source's frame.
 
@@ -341,6 +360,49 @@ class Field(Renderable):
             raise InputError(f"{path} is damaged (its exposure is {exposure!s:.40}); fit it again")
         sparse = SparseField.from_file(data, str(path)).to(steps.choose_device(device))
         return cls(sparse, data.working_from_input, float(exposure), scene)
+
+
+@dataclass(frozen=True)
+class Splats(Renderable):
+    """Gaussian splats in the source's frame, as bright as the training images were taken: ours, or others' (`Splats.open`).
+
+    Attributes:
+        gaussians: their parameters.
+        background: (3,) uint8 colour behind them.
+    """
+
+    gaussians: Gaussians
+    background: tuple[int, int, int] = (0, 0, 0)
+    working_from_input: Similarity = field(default_factory=Similarity.identity)
+    exposure: float = 1.0
+
+    def __len__(self) -> int:
+        return len(self.gaussians)
+
+    def working(self, intrinsics: Intrinsics, world_from_camera: Array) -> Any:
+        return self.gaussians.render(intrinsics, world_from_camera, np.array(self.background) / 255)
+
+    def save(self, path: Path | str) -> None:
+        """Write `.ply` or `.spz`.
+
+        Raises:
+            InputError: another suffix.
+            OutputError: the file cannot be written.
+        """
+        from fieldfuse.render.splat_files import save_splats
+
+        save_splats(path, self.gaussians)
+
+    @classmethod
+    def open(cls, path: Path | str) -> Splats:
+        """Splats from a `.ply` or `.spz` file, whoever made it.
+
+        Raises:
+            InputError: the file holds no splats, or is damaged.
+        """
+        from fieldfuse.render.splat_files import open_splats
+
+        return cls(open_splats(path))
 
 
 @dataclass(frozen=True)

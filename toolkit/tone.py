@@ -127,5 +127,10 @@ def exposed(colours: Array, exposure: float) -> Array:
     return colours if exposure == 1 else np.round(255 * encode(brighter(LINEAR, exposure))).astype(np.uint8)[colours]
 
 
+def unexposed(shown: Array, exposure: float) -> Array:
+    """sRGB in [0, 1] of any shape, what `exposed` made brighter as it was before; the very same object for an `exposure` of 1."""
+    return shown if exposure == 1 else np.interp(shown, encode(brighter(LINEAR, exposure)), np.arange(256) / 255).astype(np.float32)
+
+
 LINEAR = decode(np.arange(256) / 255.0).astype(np.float32)  # (256,) linear light of the stored values
 ENCODED = np.round(255 * encode((np.arange(STEPS) / (STEPS - 1)) ** 2)).astype(np.uint8)  # (STEPS,)

@@ -1,17 +1,23 @@
-"""Small random fields for tests."""
+"""Small random fields and splats for tests."""
 
 from __future__ import annotations
 
 from dataclasses import replace
 
+import numpy as np
 import torch
+from numpy.typing import NDArray
 
+from fieldfuse.camera import Intrinsics
 from fieldfuse.evaluation.sphere import sphere_field
 from fieldfuse.nerfusion.decoder import make_decoder
 from fieldfuse.render.field import Field
 from fieldfuse.training.levels import NewField, all_places
 from fieldfuse.volume.host import TorchHost
 from fieldfuse.volume.space import Space
+
+SPLAT_CAMERA = Intrinsics(45, 37, 40.0, 42.0, 21.0, 19.5)
+SPLAT_POSE = np.array([[0.936, -0.275, 0.218, 0.1], [0.289, 0.956, -0.036, -0.2], [-0.199, 0.097, 0.975, 0.05], [0, 0, 0, 1]])
 
 
 def random_field(
@@ -57,3 +63,17 @@ def coloured_field(shell: float = 0.0) -> Field:
     for parameter in field.decoder.parameters():
         parameter.data.add_(0.1 * torch.randn(parameter.shape, generator=generator))
     return replace(field, space=replace(field.space, shell=shell), background=torch.tensor([0.9, 0.2, 0.4]))
+
+
+def some_splats(count: int, degree: int, seed: int = 0) -> NDArray[np.float32]:
+    """Gaussians before the camera, a few of them beside the image or behind it, some large, some nearly opaque."""
+    rng, columns = np.random.default_rng(seed), 11 + 3 * (degree + 1) ** 2
+    values = rng.normal(0, 0.3, (count, columns))
+    depth = rng.uniform(1, 3, count)
+    depth[: count // 10] *= -1
+    at = np.stack([rng.uniform(-0.7, 0.7, count) * depth, rng.uniform(-0.6, 0.6, count) * depth, depth], 1)
+    values[:, :3] = at @ SPLAT_POSE[:3, :3].T + SPLAT_POSE[:3, 3]
+    values[:, 3:6] = rng.uniform(np.log(0.01), np.log(0.25), (count, 3))
+    values[:, 6:10] = rng.normal(size=(count, 4))
+    values[:, 10] = rng.uniform(-4, 5, count)
+    return values.astype(np.float32)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
@@ -27,13 +28,22 @@ def read_ply_points(path: Path) -> Array:
     except OSError as error:
         raise InputError(f"cannot read {path}: {error.strerror or error}") from error
     try:
-        points = _parse(content)
+        points = ply_columns(content, lambda _: list("xyz"))
     except (ValueError, KeyError, IndexError, OverflowError, MemoryError) as error:
         raise InputError(f"{path} is not a readable PLY file ({first_line(error)}); correct it or remove it from the capture") from error
     return points[np.isfinite(points).all(axis=1)]
 
 
-def _parse(content: bytes) -> Array:
+def ply_columns(content: bytes, wanted: Callable[[list[str]], list[str]], most: int | None = None, kind: type = np.float64) -> Array:
+    """(N, C) of `kind`: columns of a PLY file's vertices, which come first in it.
+
+    Args:
+        wanted: from the names of all columns those that are read.
+        most: vertices.
+
+    Raises:
+        ValueError, KeyError, IndexError, OverflowError, MemoryError: it is not such a file.
+    """
     end = content.find(b"end_header", 0, MAX_HEADER)
     start = content.find(b"\n", end) + 1
     if not content.startswith(b"ply") or end < 0 or start == 0:
@@ -54,16 +64,21 @@ def _parse(content: bytes) -> Array:
         elif words[0] == "property" and element == "vertex":
             columns.append((words[2], ORDERS[order] + TYPES[words[1]]))
     names = [name for name, _ in columns]
-    indices = [names.index(axis) for axis in "xyz"]
+    indices = [names.index(name) for name in wanted(names)]
     if count < 0:
         raise ValueError("a negative number of vertices")
+    if most is not None and count > most:
+        raise ValueError(f"{count} vertices; at most {most} can be read")
     if order == "ascii":
         lines = content[start:].decode("ascii", errors="replace").split("\n", count)[:count]
-        points = np.array([[float(words[i]) for i in indices] for words in map(str.split, lines)], dtype=np.float64).reshape(-1, 3)
+        numbers = [[float(words[i]) for i in indices] for words in map(str.split, lines)]
+        points: Array = np.array(numbers, dtype=kind).reshape(-1, len(indices))
     else:
         layout = np.dtype(columns)
         rows = np.frombuffer(content, dtype=layout, count=min(count, (len(content) - start) // layout.itemsize), offset=start)
-        points = np.stack([rows[axis].astype(np.float64) for axis in "xyz"], axis=1)
+        points = np.empty((len(rows), len(indices)), kind)
+        for column, index in enumerate(indices):
+            points[:, column] = rows[names[index]]
     if len(points) != count:
         raise ValueError("fewer vertices than in the header")
     return points

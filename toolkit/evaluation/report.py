@@ -20,7 +20,7 @@ POSES = ("source", "registered", "total", "models")
 STAGE = ("name", "seconds", "peak_memory_mb", "cached")
 FIELD = ("voxel_size", "blocks", "voxels", "bytes")
 POINT = ("seconds", "psnr")
-METHODS = (("field", "Field"), ("network", "Networks alone"), ("tsdf", "TSDF"))
+METHODS = (("field", "Field"), ("network", "Networks alone"), ("splats", "Splats"), ("tsdf", "TSDF"))
 SFM_NOTE = (
     "Camera poses were estimated from all images, test views included; "
     "the colours of test views were never shown to anything that fits appearance."
@@ -105,7 +105,7 @@ def report_data(data: dict[str, Any], folder: Path | None = None) -> dict[str, A
     if not isinstance(data, dict):
         raise InputError(f"a report is made of a table of names and values, not of a {type(data).__name__}")
     evaluation = part(data.get("evaluation"), ("field", "tsdf"), "evaluation")
-    for method in ("field", "tsdf", "network"):
+    for method, _ in METHODS:
         if evaluation.get(method) is not None:
             evaluation[method] = part(evaluation[method], SCORE, f"evaluation.{method}")
     floor = data.pop("baseline", None) or evaluation.get("nearest_image")
@@ -136,6 +136,8 @@ def score_rows(data: dict[str, Any]) -> list[dict[str, Any]]:
         note = ""
         if (frames := score.get("key_frames")) is not None:
             note = f"{words.counted(frames, 'key frame')} fused in {words.duration(score.get('seconds'))}, nothing fitted"
+        if (gaussians := score.get("gaussians")) is not None:
+            note = f"{words.counted(gaussians, 'Gaussian')}, harmonics of degree {score.get('degree')}"
         rows.append({**score, "title": title, "note": note, "part": False})
         if score.get("psnr_masked") is not None:
             note = f"where it has surface: {words.share(score.get('coverage'))} of the pixels"

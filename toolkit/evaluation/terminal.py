@@ -19,8 +19,8 @@ NARROW_LABELS, NARROW = 40, 17  # the same on a terminal that is too narrow for 
 
 
 def report_text(data: dict[str, Any], width: int = WIDEST) -> str:
-    """One row a method (field, networks alone, TSDF, nearest image), then facts of the run, in lines of at most `width` characters; the
-    facts alone when nothing was scored. `data` as for `write_report`."""
+    """One row a method (field, networks alone, splats, TSDF, nearest image), then facts of the run, in lines of at most `width` characters;
+    the facts alone when nothing was scored. `data` as for `write_report`."""
     data = report_data(data)
     rows = score_rows(data)
     out = Table(box=box.SIMPLE_HEAD, title_justify="left", caption_justify="left", caption_style="")

@@ -261,6 +261,18 @@ def seen_voxels(
     Raises:
         Interrupted: the user asked to stop.
     """
+    weight = seen_weights(field, intrinsics, world_from_camera, progress)
+    return (weight > least) | (dilate(field.topology, weight > max(FIRM, least), 1, grow=False)[1] & field.occupied)
+
+
+def seen_weights(
+    field: Field, intrinsics: Sequence[Intrinsics], world_from_camera: Array, progress: Progress = SILENT
+) -> torch.Tensor:
+    """(M · 512,) largest share of a pixel's light that a voxel holds, over pinhole views (N, 4, 4); 1 for the strongest of a ray that ends.
+
+    Raises:
+        Interrupted: the user asked to stop.
+    """
     space, volume, threads = make_space(field), make_volume(field), torch.get_num_threads()
     cameras = np.array([(c.fx, c.fy, c.cx, c.cy, c.width, c.height) for c in intrinsics], np.float32).reshape(-1, 6)
     poses = np.ascontiguousarray(world_from_camera[:, :3], np.float32)
@@ -277,5 +289,4 @@ def seen_voxels(
 
     share(part, range(threads), threads)
     progress.check()
-    weight = torch.from_numpy((marks.max(0) >> 4).astype(np.float32) / 4095)
-    return (weight > least) | (dilate(field.topology, weight > max(FIRM, least), 1, grow=False)[1] & field.occupied)
+    return torch.from_numpy((marks.max(0) >> 4).astype(np.float32) / 4095)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -26,10 +27,13 @@ from fieldfuse.nerfusion.training.scenes import (
     synthetic_folders,
     synthetic_scene,
 )
+from fieldfuse.render.splat_files import open_splats, save_splats, to_ply
+from fieldfuse.render.splats import Splats
 from fieldfuse.simulate.eye import Rays
 from fieldfuse.simulate.mesh_scene import load_mesh_scene
 from tests.capture.layouts import LAYOUTS
 from tests.nerfusion.training import layouts
+from tests.render.made import some_splats
 from tests.stability.fuzz.watch import all_of
 
 MESHES = ("ascii.ply", "binary.ply", "coloured.ply", "model.obj", "model.mtl", "picture.png", "model.glb", "model.gltf")
@@ -73,6 +77,32 @@ def read_meshes(root: Path, number: int) -> None:
         *(lambda name=name: surface_points(read_mesh(root / name), 50) for name in names),  # type: ignore[misc]
         *(lambda name=name: load_mesh_scene(root / name).see(rays) for name in names),  # type: ignore[misc]
     )
+
+
+SPLATS = ("0.ply", "1.ply", "ascii.ply", "3.spz", "1.spz")
+
+
+def make_splats(root: Path) -> None:
+    """Splats of several degrees in both formats."""
+    root.mkdir(parents=True, exist_ok=True)
+    for name in SPLATS:
+        values = some_splats(12, 0 if name == "ascii.ply" else int(name[0]))
+        save_splats(root / name, Splats(values, np.zeros(3)))
+    header, rows = to_ply(Splats(values[:, :14], np.zeros(3))).split(b"end_header\n", 1)
+    lines = "\n".join(" ".join(f"{value:.5g}" for value in row) for row in np.frombuffer(rows, "<f4").reshape(12, -1))
+    text = header.replace(b"binary_little_endian", b"ascii") + b"end_header\n" + lines.encode()
+    (root / "ascii.ply").write_bytes(text)
+
+
+def read_splats(root: Path, number: int) -> None:
+    """Read them and draw what was read."""
+
+    def drawn(name: str) -> None:
+        splats = open_splats(root / name)
+        if not np.isfinite(splats.render(Intrinsics(40, 30, 35.0, 36.0, 21.0, 14.0), np.eye(4)).rgb).all():
+            raise ValueError("a colour that is not finite")
+
+    all_of(*(partial(drawn, name) for name in SPLATS))
 
 
 def make_truth(root: Path) -> None:

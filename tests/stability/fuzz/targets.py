@@ -38,12 +38,15 @@ from tests.capture.spheres import room, walk
 from tests.stability.fuzz.given import (
     DATASETS,
     MESHES,
+    SPLATS,
     TRUTH,
     make_datasets,
     make_meshes,
+    make_splats,
     make_truth,
     read_datasets,
     read_meshes,
+    read_splats,
     read_truth,
 )
 from tests.stability.fuzz.models import make_models, make_training, read_baked_field, read_models, read_training
@@ -358,6 +361,7 @@ TARGETS: tuple[Target, ...] = (
     Target("models", ("weights.safetensors", "scene.yaml", "scene.yaml"), make_models, read_models, 1.0),
     Target("training", TRAINING_FILES, make_training, read_training, 1.0),
     Target("meshes", MESHES, make_meshes, read_meshes, 2.0),
+    Target("splats", SPLATS, make_splats, read_splats, 1.5),
     Target("ground truth", TRUTH, make_truth, read_truth, 1.0),
     Target("data sets", DATASETS, make_datasets, read_datasets, 1.0),
     Target("points", ("points.ply",), make_extras, lambda root, number: read_ply_points(root / "points.ply"), 0.5),
