@@ -121,7 +121,7 @@ class Pair:
 
         def score(side: Checkout) -> float:
             folder = self.folder(side, entry)
-            options = ["--threads", "1", "--quiet", "--image-size", "320", "--budget", str(entry["detail"]), "--set", "export.formats=[ply]"]
+            options = [*BARE[:5], "--budget", str(entry["detail"]), "--set", "export.formats=[ply]"]
             side.run("compare", capture, "--out", folder, *options)
             return f_score(json.loads((folder / "compare.json").read_text()))
 

@@ -26,6 +26,7 @@ def scored(folder: Path, camera: dict[str, Any], output: str, **options: Any) ->
 
 
 @pytest.mark.slow
+@pytest.mark.timeout(1200)
 def test_a_360_degree_walk_is_as_good_as_one_with_a_plain_camera(tmp_path: Path) -> None:
     """Panoramas without poses or intrinsics; the plain camera, of as many pixels a degree, even with its true ones."""
     _, plain = scored(tmp_path / "plain", {"width": 160, "height": 120, "fov": 65}, "frames")
