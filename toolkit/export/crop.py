@@ -119,7 +119,7 @@ def cleaned(field: Field, intrinsics: Sequence[Intrinsics], world_from_camera: A
 
 
 def seen_part(field: Field, intrinsics: Sequence[Intrinsics], world_from_camera: Array, progress: Progress = SILENT) -> Field:
-    """The field without what pages leave out, since no camera sees it (`bake.seen_voxels`): rays through it take a fifth less time.
+    """The field without what pages leave out, since no camera sees it (`bake.seen_voxels`).
 
     Args:
         intrinsics, world_from_camera: pinhole cameras, (N, 4, 4), working frame; of the training views.
