@@ -41,8 +41,10 @@ LOOKED_AT, CIRCLE = 12, 256  # fisheye images by which the image circle is found
 UNLIT, LEAST_OUTSIDE = 12, 0.01  # grey level below which a pixel is black; share of an image outside the circle that matters
 WRAP = 4  # columns of a panorama that are repeated beyond its edges, for interpolation
 # Of a fisheye lens: is there a view along the axis, how many around it, and from where these are counted (in steps, from the right)
-PATTERNS = ((True, 0, 0.0), *((False, 2, at) for at in (0.0, 0.5)), (False, 3, 0.0), (True, 2, 0.0), (False, 4, 0.5))
-PATTERNS = (*PATTERNS, (True, 4, 0.0), (True, 4, 0.5), (True, 5, 0.0), (True, 6, 0.0), (True, 8, 0.0))
+PATTERNS = (
+    (True, 0, 0.0), (False, 2, 0.0), (False, 2, 0.5), (False, 3, 0.0), (True, 2, 0.0), (False, 4, 0.5),
+    (True, 4, 0.0), (True, 4, 0.5), (True, 5, 0.0), (True, 6, 0.0), (True, 8, 0.0),
+)  # fmt: skip
 TILTS = np.arange(20.0, 90.1, 5.0)  # degrees from the axis
 
 
