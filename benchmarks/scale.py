@@ -11,6 +11,7 @@ from typing import Annotated, Any
 
 import cv2
 import numpy as np
+import torch
 import typer
 from safetensors.numpy import load_file
 
@@ -20,6 +21,7 @@ from fieldfuse.camera import Array, Intrinsics, unproject
 from fieldfuse.capture.images import load_image
 from fieldfuse.capture.types import Capture
 from fieldfuse.config import PosesSettings, load_settings
+from fieldfuse.effects.effect_specs import parse
 from fieldfuse.errors import InputError
 from fieldfuse.files import read_json
 from fieldfuse.pipelines.console import make_progress
@@ -28,19 +30,20 @@ from fieldfuse.poses.gps import similarity
 from fieldfuse.poses.result import PoseResult
 from fieldfuse.poses.scaling import find_scaling
 from fieldfuse.progress import SILENT, Progress
+from fieldfuse.simulate.eye import Rays
 from fieldfuse.simulate.settings import scene_file
-from fieldfuse.simulate.simulate import simulate
+from fieldfuse.simulate.simulate import prepare, simulate
 
 SIDE = 0.1  # metres, of the markers
 PAIRS = 5  # distances that are measured, each alone
+LOW, ROUND, ABOVE = -0.118, 0.095, 0.02  # metres: plates' height over the focus; their corners from their middles; free space about them
+REACH, FEWEST = np.arange(0.14, 0.4, 0.03), 6  # metres from the table's middle; cameras that must see a whole plate
 EVEN, PATCH, APART = 0.1, 12, 0.2  # marks lie on surfaces without an edge within some pixels, and far enough from each other (metres)
 SCENES: dict[str, dict[str, Any]] = {
     "table": {
+        "camera": {"width": 960, "height": 720},  # markers are 25 to 55 pixels wide
         "path": {"kind": "orbit", "fps": 5, "speed": 0.9},
-        "markers": [
-            {"at": [0.25, 0.1, -0.118], "side": SIDE, "number": 3},
-            {"at": [-0.25, -0.1, -0.118], "side": SIDE, "number": 7, "turn": 30},
-        ],
+        "markers": [{"side": SIDE, "number": 3}, {"side": SIDE, "number": 7, "turn": 30}],  # `laid` says where
         "gps": {"noise": 0.02, "noise_up": 0.03},
     },
     "street": {"path": {"kind": "fly", "fps": 2, "speed": 1.2}, "effects": ["background"], "gps": {"noise": 0.05, "noise_up": 0.08}},
@@ -86,6 +89,8 @@ def measured(folder: Path, scene: str, seed: int, frames: int, progress: Progres
     """Errors of the unit of length in percent by each way that the scene has, and those that were stated."""
     settings, setup = load_settings(), SCENES[scene]
     filmed = {**setup, "scene": scene, "seed": seed, "output": "photos", "path": {**setup["path"], "frames": frames}}
+    if "markers" in setup:
+        filmed["markers"] = laid(filmed)
     simulate(scene_file(filmed, "the benchmark"), folder / "capture", progress=progress)
     capture = steps.read_capture(folder / "capture" / "images", folder, settings, progress)
     poses = steps.camera_poses(capture, folder, settings, progress)
@@ -104,6 +109,40 @@ def measured(folder: Path, scene: str, seed: int, frames: int, progress: Progres
             error, stated = np.median(np.abs(np.array(found)), axis=0)
             row[way] = {"error": round(float(error), 4), "stated": round(float(stated), 4), "each": [round(one[0], 4) for one in found]}
     return row
+
+
+def laid(filmed: Row) -> list[dict[str, Any]]:
+    """A table's markers as a person lays them: flat, on spots where nothing stands, and where most of the cameras see them whole.
+
+    Raises:
+        InputError: the table has too few such spots.
+    """
+    bare = scene_file({**filmed, "markers": []}, "the benchmark")
+    film = prepare(bare, Path(), parse(bare.effects, "the effects"))
+    scene, eyes = film.scene, film.world_from_camera[:, :3, 3]
+    around = np.linspace(0, 2 * np.pi, 16, endpoint=False)
+    plate = np.array([[0.0, 0.0, LOW], *([part * np.cos(a), part * np.sin(a), LOW] for part in (0.5 * ROUND, ROUND) for a in around)])
+    found = list[tuple[int, Array]]()
+    for angle in np.linspace(0, 2 * np.pi, 24, endpoint=False):
+        for reach in REACH:
+            spot = np.array([reach * np.cos(angle), reach * np.sin(angle), 0.0])
+            points = np.asarray(scene.focus) + spot + plate
+            near = scene.clearance(torch.from_numpy(points + np.array([0, 0, ABOVE])).float()).cpu().numpy()
+            if np.abs(near - ABOVE).max() > 0.005:  # something stands there, or the table ends
+                continue
+            ways = points[None] - eyes[:, None]
+            lengths = np.linalg.norm(ways, axis=-1)
+            starts, ways = np.repeat(eyes, len(plate), axis=0), (ways / lengths[..., None]).reshape(-1, 3)
+            rays = Rays(torch.from_numpy(starts).float(), torch.from_numpy(ways).float(), 0.0)
+            seen = scene.see(rays).distance.cpu().numpy().reshape(lengths.shape)
+            found.append((int((seen > lengths - 0.01).all(axis=1).sum()), spot))
+    spots = list[Array]()
+    for views, spot in sorted(found, key=lambda one: -one[0]):
+        if views >= FEWEST and all(np.linalg.norm(spot - other) > 2 * ROUND for other in spots):
+            spots.append(spot)
+    if len(spots) < len(filmed["markers"]):
+        raise InputError(f"seed {filmed['seed']}: the table has {len(spots)} free spots in view for {len(filmed['markers'])} markers")
+    return [{**marker, "at": [*spot[:2].tolist(), LOW]} for marker, spot in zip(filmed["markers"], spots, strict=False)]
 
 
 def _error(capture: Capture, poses: PoseResult, settings: PosesSettings, unit: float) -> tuple[float, float] | None:

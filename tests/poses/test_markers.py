@@ -60,6 +60,26 @@ def test_corners_lie_where_light_is_half_way(degrees: float) -> None:
     inside = (np.abs((np.stack([u, v], axis=-1) - middle) @ turn) < half).all(axis=-1)
     light = cv2.resize(np.where(inside, 0.02, 0.8), (small, small), interpolation=cv2.INTER_AREA)
     grey = np.round(255 * (1.055 * light ** (1 / 2.4) - 0.055)).astype(np.uint8)
-    found = refined(grey, corners - 0.5 + [[0.8, 0.5], [-0.6, 0.4], [-0.5, -0.8], [0.7, -0.3]]) + 0.5
-    assert np.abs(found - corners).max() < 0.1
+    found = refined(grey, corners - 0.5 + [[0.8, 0.5], [-0.6, 0.4], [-0.5, -0.8], [0.7, -0.3]])
+    assert found is not None
+    assert np.abs(found + 0.5 - corners).max() < 0.1
     assert np.linalg.norm(found - found.mean(axis=0), axis=1).mean() == pytest.approx(half * np.sqrt(2), rel=0.002)
+
+
+def test_where_something_lies_on_an_edge_a_marker_takes_no_part(tmp_path: Path) -> None:
+    """Unless no other images show it."""
+    dictionary = cv2.aruco.getPredefinedDictionary(cv2.aruco.DICT_4X4_50)
+    image = np.pad(cv2.aruco.generateImageMarker(dictionary, 5, 300), 50, constant_values=255)
+    covered = image.copy()
+    cv2.circle(covered, (200, 440), 110, 150, -1)  # over the lower edge, and part of its black border
+    poses = arc(6)
+    shots = [render(pose, LARGE, before(picture))[0] for pose, picture in zip(poses, [covered] * 4 + [image] * 2, strict=True)]
+    grey = cv2.cvtColor(shots[0], cv2.COLOR_RGB2GRAY)
+    assert not Detector(parse_marker("DICT_4X4_50:0.05")).corners(grey)[5][2]
+    true = 0.05 / (1.2 * 300 / 400)
+    for chosen, most in ((range(6), 0.005), (range(4), 0.1)):
+        capture = write_capture(tmp_path / str(len(chosen)), [shots[number] for number in chosen])
+        frames = [replace(frame, intrinsics=LARGE, world_from_camera=poses[n]) for frame, n in zip(capture.frames, chosen, strict=True)]
+        found = scale_by_markers(replace(capture, kind="transforms", frames=tuple(frames)), parse_marker("DICT_4X4_50:0.05"))
+        assert found.metres == pytest.approx(true, rel=most)
+        assert f"in {2 if len(chosen) == 6 else 4} images" in found.text

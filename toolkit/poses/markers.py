@@ -32,6 +32,8 @@ EDGE_LEAST, EDGE_MOST = 2.0, 12.0  # pixels of that
 EDGE_STEP = 0.25  # pixels
 EDGE_PART = (0.12, 0.88)  # of an edge that is looked at: corners are round
 LEAST_CONTRAST = 0.03  # linear light from black to white
+STRAIGHT = 0.2, 0.01  # pixels, and share of an edge, that its points lie beside a line (root mean square): a wide lens bends edges a little
+LEAST_EDGE = 0.75  # share of an edge's points that must lie on the line; something lies on the marker otherwise
 MOST_MOVED = 4.0  # pixels by which a corner may lie beside the detector's
 MOST_VIEWS = 300  # images that are looked at, evenly spread
 
@@ -65,8 +67,9 @@ class Detector:
         else:
             self._aruco = cv2.aruco.ArucoDetector(dictionary, how)
 
-    def corners(self, grey: Array) -> dict[int, tuple[Array, Array]]:
-        """By the number of a marker (`BOARD`: of the board) which corners are seen (N,) and where (N, 2), pixel centres at +0.5.
+    def corners(self, grey: Array) -> dict[int, tuple[Array, Array, bool]]:
+        """By the number of a marker (`BOARD`: of the board) which corners are seen (N,), where (N, 2), pixel centres at +0.5, and whether
+        that is exact: False where a marker's edges are not whole and straight, and corners are the detector's own.
 
         Args:
             grey: (H, W) uint8 sRGB.
@@ -75,15 +78,17 @@ class Detector:
             found, numbers, _, _ = self._charuco.detectBoard(grey)
             if numbers is None or len(numbers) == 0:
                 return {}
-            return {BOARD: (np.asarray(numbers).ravel(), np.asarray(found, dtype=np.float64).reshape(-1, 2) + 0.5)}
+            return {BOARD: (np.asarray(numbers).ravel(), np.asarray(found, dtype=np.float64).reshape(-1, 2) + 0.5, True)}
         outlines, numbers, _ = self._aruco.detectMarkers(grey)
         if numbers is None:
             return {}
         seen: dict[int, list[Any]] = defaultdict(list)
         for number, corner in zip(np.asarray(numbers).ravel(), outlines, strict=True):
-            seen[int(number)].append(refined(grey, np.asarray(corner, dtype=np.float64).reshape(4, 2)) + 0.5)
+            rough = np.asarray(corner, dtype=np.float64).reshape(4, 2)
+            fine = refined(grey, rough)
+            seen[int(number)].append((rough + 0.5, False) if fine is None else (fine + 0.5, True))
         # Of a marker that an image shows twice nothing says which is which.
-        return {number: (np.arange(4), places[0]) for number, places in seen.items() if len(places) == 1}
+        return {number: (np.arange(4), *places[0]) for number, places in seen.items() if len(places) == 1}
 
     def shape(self, number: int) -> Array:
         """(N, 3) corners in metres, in the order in which `corners` numbers them."""
@@ -93,9 +98,9 @@ class Detector:
         return np.array([[-half, half, 0], [half, half, 0], [half, -half, 0], [-half, -half, 0]])
 
 
-def refined(grey: Array, corners: Array) -> Array:
+def refined(grey: Array, corners: Array) -> Array | None:
     """(4, 2) corners of a black square on white where straight lines along its edges meet, from corners (4, 2) near to them; pixel centres
-    are whole numbers.
+    are whole numbers. None: an edge is not seen whole, or is not straight, as where something lies on it.
 
     An edge lies where light, not its sRGB value, is half way from black to white: a lens and a pixel take means of light. By sRGB values
     a black square of 40 pixels comes out half a pixel too small.
@@ -125,20 +130,22 @@ def refined(grey: Array, corners: Array) -> Array:
         points = first + at[:, None] * along + edge[:, None] * outward
         for _ in range(3):
             if fine.sum() < 4:
-                return corners
+                return None
             middle = points[fine].mean(axis=0)
             normal = np.linalg.svd(points[fine] - middle)[2][1]
             off = np.abs((points - middle) @ normal)
             fine &= off < max(0.3, 3 * float(np.median(off[fine])))
+        if fine.mean() < LEAST_EDGE or np.sqrt((off[fine] ** 2).mean()) > max(STRAIGHT[0], STRAIGHT[1] * length):
+            return None
         lines.append((normal, float(normal @ middle)))
     met = []
     for before, after in zip(np.roll(np.arange(4), 1), np.arange(4), strict=True):
         normals = np.array([lines[before][0], lines[after][0]])
         if abs(np.linalg.det(normals)) < 0.1:
-            return corners
+            return None
         met.append(np.linalg.solve(normals, [lines[before][1], lines[after][1]]))
     found = np.array(met)
-    return found if np.abs(found - corners).max() < MOST_MOVED else corners
+    return found if np.abs(found - corners).max() < MOST_MOVED else None
 
 
 def linear_light(grey: Array) -> Array:
@@ -154,10 +161,9 @@ def scale_by_markers(capture: Capture, marker: Marker, progress: Progress = SILE
         InputError: no image, or only one, shows a marker, or the corners do not fit together.
     """
     detector, exif = Detector(marker), turns_by_exif(capture)
-    seen: dict[int, dict[int, list[tuple[int, Array]]]] = defaultdict(lambda: defaultdict(list))  # marker → corner → image and pixel
+    seen: dict[int, list[tuple[int, Array, Array, bool]]] = defaultdict(list)  # marker → image, which corners, pixels, whether exact
     cameras: list[Intrinsics] = []
     poses: list[Array] = []
-    shown: set[int] = set()
     frames = [frame for frame in capture.frames if frame.intrinsics is not None and frame.world_from_camera is not None]
     for index in np.unique(np.linspace(0, len(frames) - 1, min(len(frames), MOST_VIEWS)).round().astype(int)):
         frame = frames[int(index)]
@@ -166,19 +172,17 @@ def scale_by_markers(capture: Capture, marker: Marker, progress: Progress = SILE
         assert frame.intrinsics is not None and frame.world_from_camera is not None
         image = np.ascontiguousarray(load_image(frame, exif=exif)[..., :3])
         camera = frame.intrinsics.scaled(image.shape[1], image.shape[0])
-        for number, (which, places) in detector.corners(cv2.cvtColor(image, cv2.COLOR_RGB2GRAY)).items():
-            shown.add(number)
-            for corner, place in zip(which, places, strict=True):
-                seen[number][int(corner)].append((len(cameras), place))
+        for number, (which, places, exact) in detector.corners(cv2.cvtColor(image, cv2.COLOR_RGB2GRAY)).items():
+            seen[number].append((len(cameras), which, places, exact))
         cameras.append(camera)
         poses.append(frame.world_from_camera)
     what = "the board" if marker.squares is not None else f"a marker of {marker.dictionary}"
-    if not shown:
+    if not seen:
         raise InputError(
             f"none of the {counted(len(cameras), 'image')} of {capture.root} shows {what}; check the dictionary, and that it is sharp, "
             "flat and at least 40 pixels wide, with a white rim"
         )
-    found = [one for number in sorted(seen) if (one := _sized(detector.shape(number), seen[number], cameras, np.array(poses))) is not None]
+    found = _all_sized(detector, seen, cameras, np.array(poses), True) or _all_sized(detector, seen, cameras, np.array(poses), False)
     if not found:
         raise InputError(
             f"{what} is seen, but in no two images from different places whose poses agree on its corners; take more images of it, and "
@@ -194,6 +198,22 @@ def scale_by_markers(capture: Capture, marker: Marker, progress: Progress = SILE
     seen_by = max(one[2] for one in found)
     text = f"{many} of known size in {seen_by} images: one unit of the poses is {np.exp(mean):.6g} m, ±{100 * error:.2g}%"
     return Sized(float(np.exp(mean)), error, text)
+
+
+def _all_sized(
+    detector: Detector, seen: dict[int, list[tuple[int, Array, Array, bool]]], cameras: list[Intrinsics], poses: Array, only_exact: bool
+) -> list[tuple[float, float, int]]:
+    """`_sized` of all markers that have one: by exact corners, or by all, which make them too small."""
+    found = []
+    for number in sorted(seen):
+        corners: dict[int, list[tuple[int, Array]]] = defaultdict(list)
+        for image, which, places, exact in seen[number]:
+            if exact or not only_exact:
+                for corner, place in zip(which, places, strict=True):
+                    corners[int(corner)].append((image, place))
+        if (one := _sized(detector.shape(number), corners, cameras, poses)) is not None:
+            found.append(one)
+    return found
 
 
 def _sized(
