@@ -28,7 +28,7 @@ from fieldfuse.files import write_json
 from fieldfuse.memory import require_pictures
 from fieldfuse.pipelines.fields import Fitted
 from fieldfuse.pipelines.job import Job
-from fieldfuse.pipelines.pictures import NAME, PAGE, camera_of, orbit_cameras, pictures, put_page
+from fieldfuse.pipelines.pictures import NAME, PAGE, orbit_cameras, put_page
 from fieldfuse.pipelines.prepare import Prepared
 from fieldfuse.pipelines.schemas import read_export_facts
 from fieldfuse.pipelines.splats import SPLAT_FILES, SPZ, remove_old_splats, splats_or_why_not
@@ -36,7 +36,9 @@ from fieldfuse.pipelines.stages import CollectingStage
 from fieldfuse.pipelines.surfaces import in_input, put_cloud, put_points
 from fieldfuse.pipelines.textured import TEXTURED, put_textured
 from fieldfuse.poses.region import Region
+from fieldfuse.render.film import film
 from fieldfuse.tone import exposed
+from fieldfuse.tsdf.mesh import as_bytes
 
 if TYPE_CHECKING:
     from fieldfuse.render.splats import Splats
@@ -191,10 +193,10 @@ def export_field(job: Job, ready: Prepared, fitted: Fitted, wish: Wish, splats: 
     if "video" in formats:
         _, lenses, around = orbit_cameras(views, scene, job.settings.export.video_frames)
         job.progress.update(0, len(around), "orbit video")
-        camera = camera_of(job, shown, views, scene, baked=False)
         lenses = [at_most(lens, VIDEO_SIDE) for lens in lenses]
         require_pictures(lenses, kept=False, advice="leave video out of export.formats")
-        write_video(folder / "orbit.mp4", pictures(camera, lenses, around, job.progress), FPS)
+        frames = (exposed(as_bytes(frame), views.exposure) for frame in film(shown, lenses, around, job.progress))
+        write_video(folder / "orbit.mp4", frames, FPS)
         out.files.append(folder / "orbit.mp4")
     if isinstance(splats, str):
         undone |= formats & set(SPLAT_FILES)
