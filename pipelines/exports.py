@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import asdict, dataclass, field, replace
 from functools import partial
 from pathlib import Path
@@ -28,7 +29,7 @@ from fieldfuse.files import write_json
 from fieldfuse.memory import require_pictures
 from fieldfuse.pipelines.fields import Fitted
 from fieldfuse.pipelines.job import Job
-from fieldfuse.pipelines.pictures import NAME, PAGE, camera_of, orbit_cameras, pictures, put_page
+from fieldfuse.pipelines.pictures import NAME, PAGE, orbit_cameras, put_page
 from fieldfuse.pipelines.prepare import Prepared
 from fieldfuse.pipelines.schemas import read_export_facts
 from fieldfuse.pipelines.splats import SPLAT_FILES, SPZ, remove_old_splats, splats_or_why_not
@@ -36,7 +37,9 @@ from fieldfuse.pipelines.stages import CollectingStage
 from fieldfuse.pipelines.surfaces import in_input, put_cloud, put_points
 from fieldfuse.pipelines.textured import TEXTURED, put_textured
 from fieldfuse.poses.region import Region
+from fieldfuse.render.film import film
 from fieldfuse.tone import exposed
+from fieldfuse.tsdf.mesh import as_bytes
 
 if TYPE_CHECKING:
     from fieldfuse.render.splats import Splats
@@ -49,6 +52,7 @@ SURFACES = {"points", *CLOUDS, *MESHES, *TEXTURES}
 UNDISTORTED = "undistorted"
 MOST_TRIANGLES = 2_000_000
 VIDEO_SIDE = 640
+BESIDE_BYTES = 4 * 2**30  # that are free where the page and the video are made beside meshes
 FPS = 30
 REMOVED = "of {}, and removed: {}; `fieldfuse export {} --formats …` exports this one"
 GONE = (
@@ -138,10 +142,9 @@ def export_results(job: Job, ready: Prepared, fitted: Fitted, wish: Wish) -> dic
 
 def export_field(job: Job, ready: Prepared, fitted: Fitted, wish: Wish, splats: Splats | str | None) -> Exported:
     """What this command or the settings' `export.formats` name, in the input's frame; `splats`: those of the run, or why there are none."""
-    from fieldfuse.export.video import write_video
     from fieldfuse.render.splat_files import save_splats
 
-    views, scene, folder = ready.views, ready.scene, job.folder / "exports"
+    views, folder = ready.views, job.folder / "exports"
     formats = set(job.settings.export.formats if wish.formats is None else wish.formats)
     notes: list[str] = []
     out = Exported({"mesh": None, "notes": notes})
@@ -159,43 +162,34 @@ def export_field(job: Job, ready: Prepared, fitted: Fitted, wish: Wish, splats: 
             undone |= names
             notes.append(f"{what} left out: {gone}")
     out.whole = not undone
-    if surfaces := (formats - undone) & SURFACES:
-        try:
-            out.facts["mesh"], out.files = export_surface(job, ready, (fitted, region), surfaces, notes)
-            undone |= {name for name, file in TEXTURES.items() if folder / file not in out.files}
-        except InputError as error:
-            undone |= surfaces
-            notes.append(f"points and meshes were left out: {error}")
-    if ready.poses.georeference is not None:
-        out.files += write_georeference(folder, ready.poses.georeference)
-    if wanted := (formats - undone) & {"cameras", UNDISTORTED}:
-        sparse = starting_points(job, ready, fitted)
-        if "cameras" in wanted:
-            put_cameras(folder / "cameras", ready.posed, *sparse)
-            out.files += [path for path in sorted((folder / "cameras").rglob("*")) if path.is_file()]
-        if UNDISTORTED in wanted:
+    # Meshes and texture keep one core busy for much of their time, so that the page and the video are made beside them.
+    roomy = fitted.field.device.type == "cpu" and memory.available() > BESIDE_BYTES
+    with ThreadPoolExecutor(1) as pool:
+        beside = pool.submit(put_shown, job, ready, fitted, formats) if roomy and formats & SURFACES - undone else None
+        if surfaces := (formats - undone) & SURFACES:
             try:
-                out.files += write_undistorted(folder / UNDISTORTED, ready.posed, *sparse, views.test, job.progress)
+                out.facts["mesh"], out.files = export_surface(job, ready, (fitted, region), surfaces, notes)
+                undone |= {name for name, file in TEXTURES.items() if folder / file not in out.files}
             except InputError as error:
-                undone, out.whole = undone | {UNDISTORTED}, False
-                notes.append(f"undistorted images were left out: {error}")
-    shown = fitted.field
-    if formats & {PAGE, "video"}:
-        shown = seen_part(shown, ready.training.intrinsics, ready.training.world_from_camera, job.progress)
-    if PAGE in formats:
-        try:
-            out.files.append(put_page(job, folder / NAME, shown, views, scene))
-        except InputError as error:
-            undone.add(PAGE)
-            notes.append(f"the page to walk through was left out: {error}")
-    if "video" in formats:
-        _, lenses, around = orbit_cameras(views, scene, job.settings.export.video_frames)
-        job.progress.update(0, len(around), "orbit video")
-        camera = camera_of(job, shown, views, scene, baked=False)
-        lenses = [at_most(lens, VIDEO_SIDE) for lens in lenses]
-        require_pictures(lenses, kept=False, advice="leave video out of export.formats")
-        write_video(folder / "orbit.mp4", pictures(camera, lenses, around, job.progress), FPS)
-        out.files.append(folder / "orbit.mp4")
+                undone |= surfaces
+                notes.append(f"points and meshes were left out: {error}")
+        if ready.poses.georeference is not None:
+            out.files += write_georeference(folder, ready.poses.georeference)
+        if wanted := (formats - undone) & {"cameras", UNDISTORTED}:
+            sparse = starting_points(job, ready, fitted)
+            if "cameras" in wanted:
+                put_cameras(folder / "cameras", ready.posed, *sparse)
+                out.files += [path for path in sorted((folder / "cameras").rglob("*")) if path.is_file()]
+            if UNDISTORTED in wanted:
+                try:
+                    out.files += write_undistorted(folder / UNDISTORTED, ready.posed, *sparse, views.test, job.progress)
+                except InputError as error:
+                    undone, out.whole = undone | {UNDISTORTED}, False
+                    notes.append(f"undistorted images were left out: {error}")
+    shown = beside.result() if beside is not None else put_shown(job, ready, fitted, formats)
+    out.files += shown.files
+    notes += shown.facts["notes"]
+    undone |= formats & {PAGE, "video"} - shown.made
     if isinstance(splats, str):
         undone |= formats & set(SPLAT_FILES)
         notes.append(splats)
@@ -206,6 +200,32 @@ def export_field(job: Job, ready: Prepared, fitted: Fitted, wish: Wish, splats: 
             save_splats(folder / SPLAT_FILES[SPZ], splats)
             out.files.append(folder / SPLAT_FILES[SPZ])
     out.made = formats - undone
+    return out
+
+
+def put_shown(job: Job, ready: Prepared, fitted: Fitted, formats: set[str]) -> Exported:
+    """The page and the orbit video, where they are among the formats; of both, the field without what no training view sees."""
+    from fieldfuse.export.video import write_video
+
+    views, scene, folder, out = ready.views, ready.scene, job.folder / "exports", Exported({"notes": []})
+    if not formats & {PAGE, "video"}:
+        return out
+    shown = seen_part(fitted.field, ready.training.intrinsics, ready.training.world_from_camera, job.progress)
+    if PAGE in formats:
+        try:
+            out.files.append(put_page(job, folder / NAME, shown, views, scene))
+            out.made.add(PAGE)
+        except InputError as error:
+            out.facts["notes"].append(f"the page to walk through was left out: {error}")
+    if "video" in formats:
+        _, lenses, around = orbit_cameras(views, scene, job.settings.export.video_frames)
+        job.progress.update(0, len(around), "orbit video")
+        lenses = [at_most(lens, VIDEO_SIDE) for lens in lenses]
+        require_pictures(lenses, kept=False, advice="leave video out of export.formats")
+        frames = (exposed(as_bytes(frame), views.exposure) for frame in film(shown, lenses, around, job.progress))
+        write_video(folder / "orbit.mp4", frames, FPS)
+        out.files.append(folder / "orbit.mp4")
+        out.made.add("video")
     return out
 
 

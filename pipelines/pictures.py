@@ -11,6 +11,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from fieldfuse.camera import Array, Intrinsics
+from fieldfuse.export.surface import spread
 from fieldfuse.pipelines.rendered import to_picture
 from fieldfuse.progress import Progress
 from fieldfuse.tone import exposed
@@ -26,6 +27,7 @@ Camera = Callable[[Intrinsics, Array], Any]  # lens, pose → a `Rendered`
 PAGE = "page"  # as `export.formats` has it
 NAME = "field.html"
 FLIGHT = 90  # cameras along the page's flight
+CANDIDATES = 40  # training views that are looked at for the first view
 
 
 def camera_of(job: Job, field: Field, views: Views, scene: Scene, baked: bool) -> Camera:
@@ -132,5 +134,6 @@ def _start(field: Field, views: Views, scene: Scene) -> int:
     from fieldfuse.render.overview import overview
 
     train = np.flatnonzero(~views.test)
+    train = train[spread(len(train), CANDIDATES)]
     render = partial(render_view, field, view=make_renderer(field))
     return int(train[overview(render, [views.intrinsics[i] for i in train], views.world_from_camera[train], scene.median_depth)])

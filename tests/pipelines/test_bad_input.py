@@ -189,7 +189,7 @@ CASES: dict[str, tuple[Callable[[Path], Path], str]] = {
     "100 MB": (huge_json, "100 MB"),
     "depth all zero": (depth_of(lambda depth: depth * 0), "depth"),
     "depth all NaN": (float_depth(lambda depth: depth * np.nan), "depth"),
-    "depth in metres read as millimetres": (float_depth(lambda depth: depth), "unit"),
+    "depth in a unit that nobody uses": (float_depth(lambda depth: 7 * depth), "unit"),
 }
 
 

@@ -12,7 +12,9 @@ import os
 import resource
 import signal
 import sys
+import zipfile
 from collections.abc import Callable
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -30,20 +32,28 @@ from fieldfuse.capture.convert import convert_images
 from fieldfuse.capture.film import Film
 from fieldfuse.capture.photos import read_photos
 from fieldfuse.capture.select import select_frames
+from fieldfuse.capture.sphere import announced, cut_images
 from fieldfuse.capture.storage import save_views
-from fieldfuse.capture.types import Views
+from fieldfuse.capture.types import Capture, Frame, Views
+from fieldfuse.capture.unpack import unpack
 from fieldfuse.capture.video import read_video
 from fieldfuse.config import CaptureSettings, Settings
 from fieldfuse.errors import OutputError
 from fieldfuse.evaluation.compare_page import write_comparison
 from fieldfuse.evaluation.report_page import write_report
 from fieldfuse.evaluation.tradeoff_page import write_tradeoff
+from fieldfuse.export.atlas import make_atlas
 from fieldfuse.export.cameras import write_cameras
+from fieldfuse.export.clouds import write_cloud
+from fieldfuse.export.georeference import write_georeference
 from fieldfuse.export.mesh import write_mesh
 from fieldfuse.export.page import Tour, write_page
 from fieldfuse.export.ply import write_points
+from fieldfuse.export.undistorted import write_undistorted
+from fieldfuse.export.usd import write_usdz
 from fieldfuse.export.video import write_video
 from fieldfuse.files import write_json
+from fieldfuse.georeference import Georeference
 from fieldfuse.nerfusion.training.checkpoint import TrainState, save_checkpoint
 from fieldfuse.nerfusion.training.curve import Curve
 from fieldfuse.nerfusion.training.scenes import write_shard
@@ -53,6 +63,8 @@ from fieldfuse.pipelines.folder import RunFolder
 from fieldfuse.pipelines.rendered import Picture, Pictures, save_pictures, write_png, write_pngs
 from fieldfuse.render.bake import bake
 from fieldfuse.render.bake_file import write_baked
+from fieldfuse.render.splat_files import save_splats
+from fieldfuse.render.splats import Splats
 from fieldfuse.simulate import procedural
 from fieldfuse.simulate.materials import texture_bank
 from fieldfuse.simulate.settings import scene_file
@@ -65,6 +77,7 @@ from tests.capture.layouts import write_record3d, write_sens
 from tests.evaluation.test_compare_page import made, pictures
 from tests.evaluation.test_tradeoff import ladder
 from tests.nerfusion.training.tiny import tiny_settings
+from tests.render.made import some_splats
 from tests.simulate.test_simulate import SMALL
 from tests.stability.hard.captures import poses, texture
 from tests.stability.hard.fields import small_field
@@ -94,8 +107,10 @@ def writers() -> dict[str, Write]:
         "write_pngs": lambda folder: write_pngs(folder, "a", pictures, 1.0),
         "write_png": lambda folder: write_png(folder / "a.png", pixels),
         "write_points": lambda folder: write_points(folder / "points.ply", mesh.vertices, mesh.colours),
-        "write_cameras": lambda folder: write_cameras(
-            folder, list("abcd"), [camera] * 4, poses(4), mesh.vertices, None, Similarity.identity()
+        "write_cameras": lambda folder: write_cameras(folder, list("abcd"), [camera] * 4, poses(4), mesh.vertices),
+        "write_georeference": lambda folder: write_georeference(folder, Georeference(47.0, 8.0, 400.0)),
+        "write_usdz": lambda folder: write_usdz(
+            folder / "textured.usdz", mesh, make_atlas(mesh, 5.0, 256), np.zeros((256, 256, 3), np.uint8), Similarity.identity()
         ),
         "write_video": lambda folder: write_video(folder / "a.mp4", [texture(i, 48, 64) for i in range(6)]),
         "write_video vp09": lambda folder: write_video(folder / "c.mp4", [texture(i, 48, 64) for i in range(6)], codec="vp09"),
@@ -104,6 +119,11 @@ def writers() -> dict[str, Write]:
             folder, {"command": "fieldfuse run", "timeline": [{"seconds": 1.0, "psnr": 20.0}] * 20}
         ),
     }
+    splats = Splats(some_splats(50, 1), np.zeros(3))
+    for suffix in ("ply", "spz"):
+        out[f"save_splats {suffix}"] = lambda folder, suffix=suffix: save_splats(folder / f"splat.{suffix}", splats)
+    for suffix in ("laz", "e57"):
+        out[f"write_cloud {suffix}"] = lambda folder, suffix=suffix: write_cloud(folder / f"a.{suffix}", mesh.vertices, mesh.colours)
     for suffix in ("ply", "obj", "glb"):
         out[f"write_mesh {suffix}"] = lambda folder, suffix=suffix: write_mesh(folder / f"mesh.{suffix}", mesh)
     return out
@@ -141,6 +161,12 @@ def more_writers(place: Path) -> dict[str, Write]:
     for index in range(3):
         pillow_heif.from_pillow(Image.fromarray(texture(index, 48, 64))).save(photos / f"{index}.heic")
 
+    cv2.imwrite(str(place / "posed.png"), texture(0, 48, 64))
+    posed = Capture("transforms", place, (Frame("posed", place / "posed.png", Intrinsics(64, 48, 60.0, 60.0, 32.0, 24.0), np.eye(4)),))
+    sphere = announced(replace(posed, frames=(replace(posed.frames[0], intrinsics=Intrinsics.equirectangular(64, 32)),)))
+    with zipfile.ZipFile(place / "photos.zip", "w") as archive:
+        archive.write(place / "posed.png", "photos/posed.png")
+
     def curve(folder: Path) -> None:
         curve = Curve(folder)
         for step in range(40):
@@ -175,6 +201,9 @@ def more_writers(place: Path) -> dict[str, Write]:
         "select_frames, a scan": lambda folder: select_frames(scan, folder / f"scan{next(numbers)}", CaptureSettings(max_frames=4)),
         "Film.write_depth, a recording's": lambda folder: recording.write_depth(0, folder / "0.npy"),
         "Film.write_depth, a scan's": lambda folder: Film.of(scan).write_depth(0, folder / "0.png"),
+        "write_undistorted": lambda folder: write_undistorted(folder / "undistorted", posed, np.zeros((1, 3)), np.zeros((1, 3), np.uint8)),
+        "cut_images": lambda folder: cut_images(sphere, folder / f"cut{next(numbers)}", 1),
+        "unpack": lambda folder: unpack(place / "photos.zip", folder / f"unpacked{next(numbers)}"),
         "convert_images": lambda folder: convert_images(read_photos(photos), folder / f"photos{next(numbers)}", 2),
         "RunFolder": run_folder,
     }  # fmt: skip

@@ -77,8 +77,11 @@ def unpack(archive: Path, folder: Path, progress: Progress = SILENT) -> None:
         if read_json(folder / MARKER) == state and all((folder / name).stat().st_size == of.file_size for name, of in members.items()):
             return
     needed = sum(member.file_size for member in members.values())
-    folder.parent.mkdir(parents=True, exist_ok=True)
-    free = shutil.disk_usage(folder.parent).free
+    try:
+        folder.parent.mkdir(parents=True, exist_ok=True)
+        free = shutil.disk_usage(folder.parent).free
+    except OSError as error:
+        raise OutputError(f"cannot write {folder}: {error.strerror}; choose another folder") from error
     if needed > free:
         megabytes = f"{needed / 2**20:.0f} MB, and {folder.parent} has {free / 2**20:.0f} MB free"
         raise OutputError(f"{archive} unpacks to {megabytes}; make room there")

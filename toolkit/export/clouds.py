@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 
 from fieldfuse.camera import Array
-from fieldfuse.errors import InputError
+from fieldfuse.errors import InputError, OutputError, first_line
 from fieldfuse.export.extras import require
 from fieldfuse.files import atomic_path
 from fieldfuse.tsdf.mesh import as_bytes
@@ -100,25 +100,28 @@ def _write_e57(path: Path, points: Array, colours: Array, normals: Array | None,
     if normals is not None:
         unit = np.clip(np.asarray(normals, np.float32), -1, 1)
         columns |= {f"nor:normal{axis}": unit[:, i] for i, axis in enumerate("XYZ")}
-    with atomic_path(path) as temporary:
-        image = e57.ImageFile(str(temporary), "w")
-        try:
-            image.extensionsAdd("", e57.E57_V1_0_URI)
-            image.extensionsAdd("nor", E57_NORMALS)
-            rows = _e57_tree(e57, image, points, colours, list(columns), "" if crs is None else crs.to_wkt())
-            pieces = {name: np.empty(min(ROWS_AT_ONCE, len(points)), values.dtype) for name, values in columns.items()}
-            buffers = e57.VectorSourceDestBuffer()
-            for name, piece in pieces.items():
-                buffers.append(e57.SourceDestBuffer(image, name, piece, len(piece), True, True))
-            writer = rows.writer(buffers)
-            for start in range(0, len(points), ROWS_AT_ONCE):
+    try:
+        with atomic_path(path) as temporary:
+            image = e57.ImageFile(str(temporary), "w")
+            try:
+                image.extensionsAdd("", e57.E57_V1_0_URI)
+                image.extensionsAdd("nor", E57_NORMALS)
+                rows = _e57_tree(e57, image, points, colours, list(columns), "" if crs is None else crs.to_wkt())
+                pieces = {name: np.empty(min(ROWS_AT_ONCE, len(points)), values.dtype) for name, values in columns.items()}
+                buffers = e57.VectorSourceDestBuffer()
                 for name, piece in pieces.items():
-                    part = columns[name][start : start + ROWS_AT_ONCE]
-                    piece[: len(part)] = part
-                writer.write(min(ROWS_AT_ONCE, len(points) - start))
-            writer.close()
-        finally:
-            image.close()
+                    buffers.append(e57.SourceDestBuffer(image, name, piece, len(piece), True, True))
+                writer = rows.writer(buffers)
+                for start in range(0, len(points), ROWS_AT_ONCE):
+                    for name, piece in pieces.items():
+                        part = columns[name][start : start + ROWS_AT_ONCE]
+                        piece[: len(part)] = part
+                    writer.write(min(ROWS_AT_ONCE, len(points) - start))
+                writer.close()
+            finally:
+                image.close()
+    except e57.E57Exception as error:  # of a full disk, too
+        raise OutputError(f"cannot write {path}: {first_line(error)}; free space or choose another folder") from error
 
 
 def _e57_tree(e57: Any, image: Any, points: Array, colours: Array, names: list[str], crs: str) -> Any:

@@ -46,15 +46,13 @@ def write_undistorted(
         OutputError: a file cannot be written.
         Interrupted: the user asked to stop.
     """
-    remove(folder)
-    try:
-        return _write(folder, posed, (points, colours), test, progress)
-    except BaseException:
-        remove(folder)  # half of it is nothing to start from
-        raise
+    with atomic_path(folder) as temporary:  # half of it is nothing to start from
+        _write(temporary, posed, (points, colours), test, progress)
+        remove(folder)
+    return [path for path in sorted(folder.rglob("*")) if path.is_file()]
 
 
-def _write(folder: Path, posed: Capture, sparse: tuple[Array, Array], test: Array | None, progress: Progress) -> list[Path]:
+def _write(folder: Path, posed: Capture, sparse: tuple[Array, Array], test: Array | None, progress: Progress) -> None:
     names, cameras, masks, partial = file_names(posed), [], [], False
     for index, (camera, image, usable) in enumerate(undistorted(posed)):
         progress.check()
@@ -78,7 +76,6 @@ def _write(folder: Path, posed: Capture, sparse: tuple[Array, Array], test: Arra
     write_colmap(folder / MODEL, names, cameras, poses, *sparse)
     write_colmap_binary(folder / MODEL, names, cameras, poses, *sparse)
     write_json(folder / "transforms.json", data)
-    return [path for path in sorted(folder.rglob("*")) if path.is_file()]
 
 
 def file_names(posed: Capture) -> list[str]:

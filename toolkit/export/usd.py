@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 
 from fieldfuse.camera import Array, Similarity
-from fieldfuse.errors import InputError
+from fieldfuse.errors import InputError, OutputError, first_line
 from fieldfuse.export.atlas import Atlas
 from fieldfuse.export.extras import require
 from fieldfuse.export.mesh import packed_texture
@@ -38,7 +38,7 @@ def write_usdz(path: Path | str, mesh: Mesh, atlas: Atlas, texture: Array, worki
     if len(mesh.triangles) == 0:
         raise InputError(f"the mesh has no triangles, which {path.name} cannot hold; check the depth it was made from")
     require("usdz")
-    from pxr import Sdf
+    from pxr import Sdf, Tf
 
     turn = Y_UP @ working_from_input.rotation
     mesh = mesh.transformed(working_from_input.inverse())
@@ -47,13 +47,16 @@ def write_usdz(path: Path | str, mesh: Mesh, atlas: Atlas, texture: Array, worki
     root = np.eye(4)
     root[:3, :3] = turn
     root[:3, 3] = -np.array([0.5 * (low[0] + high[0]), low[1], 0.5 * (low[2] + high[2])])
-    with tempfile.TemporaryDirectory() as folder, atomic_path(path) as temporary:
-        layer, picture = Path(folder) / LAYER, Path(folder) / PICTURE
-        picture.write_bytes(packed_texture(texture))
-        _write_layer(layer, mesh, atlas, root)
-        with Sdf.ZipFileWriter.CreateNew(str(temporary)) as package:
-            for file in (layer, picture):  # the layer has to come first
-                package.AddFile(str(file), file.name)
+    try:
+        with tempfile.TemporaryDirectory() as folder, atomic_path(path) as temporary:
+            layer, picture = Path(folder) / LAYER, Path(folder) / PICTURE
+            picture.write_bytes(packed_texture(texture))
+            _write_layer(layer, mesh, atlas, root)
+            with Sdf.ZipFileWriter.CreateNew(str(temporary)) as package:
+                for file in (layer, picture):  # the layer has to come first
+                    package.AddFile(str(file), file.name)
+    except Tf.ErrorException as error:
+        raise OutputError(f"cannot write {path}: {first_line(error)}; free space or choose another folder") from error
 
 
 def _write_layer(path: Path, mesh: Mesh, atlas: Atlas, root: Array) -> None:

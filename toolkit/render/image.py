@@ -36,11 +36,12 @@ class View(Protocol):
     def __call__(self, origins: torch.Tensor, directions: torch.Tensor) -> RayValues: ...
 
 
-def make_renderer(field: Field, engine: str = "auto") -> View:
+def make_renderer(field: Field, engine: str = "auto", threads: int | None = None) -> View:
     """What renders rays of `field`, for many renders: compiled on the CPU and, where a ray is decoded once, on CUDA; torch elsewhere.
 
     Args:
         engine: auto | numba | triton | torch. Numba runs on the CPU alone, Triton on CUDA alone.
+        threads: of Numba; None: as many as torch has.
     """
     chosen = choose_engine(engine, "deferred" if isinstance(field.decoder, Deferred) else "per_sample", field.device)
     if chosen == "triton":
@@ -51,7 +52,7 @@ def make_renderer(field: Field, engine: str = "auto") -> View:
         return partial(_in_chunks, field)
     from fieldfuse.render.numba_renderer import NumbaRenderer
 
-    compiled = NumbaRenderer(field)
+    compiled = NumbaRenderer(field, threads)
 
     def render(origins: torch.Tensor, directions: torch.Tensor) -> RayValues:
         values = compiled.render(origins, directions)

@@ -151,7 +151,7 @@ def test_cameras(within: Within, tmp_path: Path) -> None:
         placed = similarity(scale, away, 5)
         wanted = placed.poses(poses)
         names = [f"{index}.png" for index in range(6)]
-        write_cameras(tmp_path, names, lenses, poses, working_from_input=placed.inverse())
+        write_cameras(tmp_path, names, lenses, wanted)
         frames = read_json(tmp_path / "transforms.json")["frames"]
         read = np.array([world_from_opengl(np.array(frame["transform_matrix"])) for frame in frames])
         lines = [line.split() for line in (tmp_path / "colmap" / "images.txt").read_text().splitlines() if line.endswith(".png")]
