@@ -19,7 +19,7 @@ from fieldfuse.capture.types import MODEL_NAMES, Capture
 from fieldfuse.capture.unpack import folder_around
 from fieldfuse.errors import InputError
 from fieldfuse.export.cameras import write_cameras
-from fieldfuse.export.crop import LEAST_INSIDE, LEAST_KEPT, cleaned, cropped, kept_share, region_of, seen_part
+from fieldfuse.export.crop import seen_part
 from fieldfuse.export.extras import require
 from fieldfuse.export.georeference import write_georeference
 from fieldfuse.export.sparse import colours_in, points_of_field, stored_points
@@ -27,6 +27,7 @@ from fieldfuse.export.surface import Originals, at_most, surface_of_field, whole
 from fieldfuse.export.undistorted import write_undistorted
 from fieldfuse.files import write_json
 from fieldfuse.memory import require_pictures
+from fieldfuse.pipelines.cropping import shown_part
 from fieldfuse.pipelines.fields import Fitted
 from fieldfuse.pipelines.job import Job
 from fieldfuse.pipelines.pictures import NAME, PAGE, orbit_cameras, put_page
@@ -194,8 +195,8 @@ def export_field(job: Job, ready: Prepared, fitted: Fitted, wish: Wish, splats: 
         undone |= formats & set(SPLAT_FILES)
         notes.append(splats)
     elif splats is not None:
-        if region is not None or job.settings.export.clean:
-            notes.append("splats are of the whole field: they are neither cropped nor cleaned")
+        if job.settings.export.clean:
+            notes.append("floaters stay in splats: their steps remove what no image wants")
         if SPZ in formats:
             save_splats(folder / SPLAT_FILES[SPZ], splats)
             out.files.append(folder / SPLAT_FILES[SPZ])
@@ -227,41 +228,6 @@ def put_shown(job: Job, ready: Prepared, fitted: Fitted, formats: set[str]) -> E
         out.files.append(folder / "orbit.mp4")
         out.made.add("video")
     return out
-
-
-def shown_part(job: Job, ready: Prepared, fitted: Fitted, notes: list[str], strict: bool) -> tuple[Fitted, Region | None]:
-    """The field as `export.crop` and `export.clean` have it exported, and the region (working frame), if it was cropped; `notes` gets what
-    was done, or why it was not.
-
-    Raises:
-        InputError: with `strict`, a crop that is not possible.
-    """
-    settings, views, whole = job.settings.export, ready.training, fitted.field
-    if settings.clean:
-        part = cleaned(whole, views.intrinsics, views.world_from_camera, job.progress)
-        notes.append(f"floaters: {whole.voxels - part.voxels} of {whole.voxels} voxels were left out of exports")
-        whole = part
-    if settings.crop == "off":
-        return replace(fitted, field=whole), None
-    try:
-        region = region_of(settings.crop, ready.scene, views)
-        if region is None:
-            notes.append("export.crop=auto cropped nothing, since the cameras do not look at one object")
-            return replace(fitted, field=whole), None
-        part = cropped(whole, region)
-        kept, inside = kept_share(whole, part, region, views)
-        if part.voxels == 0:
-            raise InputError("nothing of the field lies in the region; its numbers are in the frame of the input, as points.ply has it")
-        if settings.crop == "auto" and (kept < LEAST_KEPT or inside < LEAST_INSIDE):
-            raise InputError(f"{100 * kept:.0f}% of what training images show would stay, and {100 * inside:.0f}% of what lies in the box")
-    except InputError as error:
-        if strict and settings.crop != "auto":
-            job.folder.restore()  # the next export does not try it again
-            raise InputError(f"export.crop={settings.crop} is not possible: {error}") from error
-        notes.append(f"nothing was cropped: {error}")
-        return replace(fitted, field=whole), None
-    notes.append(f"exports are cropped ({settings.crop}): they hold {100 * kept:.0f}% of what training images show")
-    return replace(fitted, field=part), region
 
 
 def export_surface(

@@ -54,7 +54,7 @@ def make_splats(job: Job, ready: Prepared, fitted: Fitted) -> Splats:
         InputError: none can be made of this field.
         Interrupted: the user asked to stop.
     """
-    from fieldfuse.export.crop import region_of
+    from fieldfuse.pipelines.cropping import shown_part
     from fieldfuse.render.splat_files import open_splats, save_splats
     from fieldfuse.training.splats import SplatSettings, splats_of_field
 
@@ -64,7 +64,7 @@ def make_splats(job: Job, ready: Prepared, fitted: Fitted) -> Splats:
     views = ready.views if fitted.left_out is None else fitted.left_out.without(ready.views)
 
     def make() -> Splats:
-        made, region = splats_of_field(fitted.field, views, frame, settings, job.progress), region_of(export.crop, ready.scene, views)
+        made, (_, region) = splats_of_field(fitted.field, views, frame, settings, job.progress), shown_part(job, ready, fitted, [], False)
         # The steps need all that the images show; what is not wanted goes afterwards.
         return made if region is None else made.take(region.inside(frame.points(made.centres)))
 
