@@ -32,7 +32,7 @@ _TOTAL = "Seconds for the whole run: picture size, voxels, a video's frames, fit
 _START = "Start of the fit: network, classical, or auto (default): the networks' with fewer than 24 training pictures."
 _FINETUNE = "Whether the networks' field is fitted (default), or the result."
 _SCALE = "Measured distance of two marked points: 'IMG_1:812,330 IMG_2:1204,341 = 1.20' (metres)."
-_MARKER = "ArUco markers in the pictures and their side in metres: DICT_4X4_50:0.05."
+_MARKER = "ArUco markers in the images and their side in metres: DICT_4X4_50:0.05."
 Source = Annotated[Path, typer.Argument(help=_SOURCE, show_default=False)]
 Target = Annotated[Path, typer.Argument(help=_TARGET, show_default=False)]
 Out = Annotated[Path, option("Folder for everything that the run makes.", "--out", "-o")]

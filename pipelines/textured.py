@@ -1,4 +1,4 @@
-"""A mesh with a texture of the training pictures, as large as they were taken."""
+"""A mesh with a texture of the training images, as large as they were taken."""
 
 from __future__ import annotations
 
@@ -39,7 +39,7 @@ def texture_tsdf(job: Job, ready: Prepared) -> None:
 
 
 def put_textured(job: Job, ready: Prepared, paths: Iterable[Path], mesh: Mesh) -> None:
-    """A coarser mesh (working frame, with normals) with a texture of the training pictures, in the input's frame, as .glb or .usdz."""
+    """A coarser mesh (working frame, with normals) with a texture of the training images, in the input's frame, as .glb or .usdz."""
     from fieldfuse import memory
     from fieldfuse.export.mesh import write_textured
     from fieldfuse.export.texture import LARGEST, Photos, textured

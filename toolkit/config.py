@@ -263,7 +263,7 @@ class CaptureSettings:
     # auto: 360° panoramas are recognised, and these and fisheye images are cut into views | perspective: neither | equirectangular: all are
     # panoramas
     projection: Annotated[str, one_of("auto", "perspective", "equirectangular")] = "auto"
-    # What floating-point pictures hold. auto: by format, profile and values | linear: light | display: values for screens (sRGB)
+    # What floating-point images hold. auto: by format, profile and values | linear: light | display: values for screens (sRGB)
     light: Annotated[str, one_of("auto", "linear", "display")] = "auto"
 
 

@@ -6,7 +6,6 @@ topocentric conversions"). UTM is left to pyproj (the extra `geo`).
 
 from __future__ import annotations
 
-import importlib
 import math
 from dataclasses import dataclass, field
 from typing import Any
@@ -15,12 +14,12 @@ import numpy as np
 
 from fieldfuse.camera import Array, Similarity
 from fieldfuse.errors import InputError, first_line
+from fieldfuse.extras import extra
 
 AXIS = 6378137.0  # metres: the ellipsoid's larger half axis
 FLATTENING = 1 / 298.257223563
 SQUARE = FLATTENING * (2 - FLATTENING)  # of the eccentricity
 SOUTHERNMOST, NORTHERNMOST = -80.0, 84.0  # degrees that UTM covers
-NEEDS = 'UTM coordinates need pyproj; install it with: pip install "fieldfuse[geo]"'
 FARTHEST = 1e6  # metres above or below the ellipsoid
 
 
@@ -114,7 +113,7 @@ class Georeference:
         Raises:
             InputError: pyproj is not installed, or there is no UTM there.
         """
-        proj, places = _pyproj(), self.to_geographic(points)
+        proj, places = pyproj(), self.to_geographic(points)
         transform = proj.Transformer.from_crs(4326, self.epsg, always_xy=True)
         east, north = transform.transform(places[..., 1], places[..., 0])
         return np.stack([east, north, places[..., 2]], axis=-1)
@@ -142,7 +141,7 @@ class Georeference:
         Raises:
             InputError: as `to_utm`.
         """
-        return str(_pyproj().CRS.from_epsg(self.epsg).to_wkt("WKT1_ESRI" if esri else "WKT1_GDAL"))
+        return str(pyproj().CRS.from_epsg(self.epsg).to_wkt("WKT1_ESRI" if esri else "WKT1_GDAL"))
 
     def to_dict(self) -> dict[str, Any]:
         """Plain JSON."""
@@ -190,8 +189,5 @@ def usable_similarity(data: Any) -> Similarity:
     return made
 
 
-def _pyproj() -> Any:
-    try:
-        return importlib.import_module("pyproj")
-    except ImportError as error:
-        raise InputError(NEEDS) from error
+def pyproj() -> Any:
+    return extra("geo", "pyproj", "a system of coordinates on earth")

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import tempfile
+from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
@@ -177,15 +178,15 @@ class Points:
         write_points(path, self.points, self.colours, self.normals)
 
 
-class Renderable:
+class Renderable(ABC):
     """What cameras see: a field or a surface, with the transform to the source's frame."""
 
     working_from_input: Similarity
     exposure: float
 
+    @abstractmethod
     def working(self, intrinsics: Intrinsics, world_from_camera: Array) -> Any:
         """What a camera of the working frame sees: `rgb`, `depth`, `opacity`."""
-        raise NotImplementedError
 
     @overload
     def render(self, camera: Camera) -> Render: ...
@@ -395,7 +396,7 @@ class Splats(Renderable):
 
     @classmethod
     def open(cls, path: Path | str) -> Splats:
-        """Splats from a `.ply` or `.spz` file, whoever made it.
+        """Splats from a `.ply` or `.spz` file, also one that another program wrote.
 
         Raises:
             InputError: the file holds no splats, or is damaged.

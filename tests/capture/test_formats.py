@@ -212,6 +212,6 @@ def test_how_much_of_a_wide_lens_is_not_used_is_said(room: Path) -> None:
     plain = check_capture(open_capture(room, projection="perspective"))
     assert any("outside of the pinhole view" in warning for warning in plain.warnings) and CUT not in plain.extra
     cut = check_capture(open_capture(room))
-    assert not any("outside of the pinhole view" in warning for warning in cut.warnings) and "8 fisheye pictures" in cut.extra[CUT]
+    assert not any("outside of the pinhole view" in warning for warning in cut.warnings) and "8 fisheye images" in cut.extra[CUT]
     path.write_text(json.dumps({**data, "camera_model": "OPENCV", "k1": -0.02}))
     assert not any("outside of the pinhole view" in warning for warning in check_capture(open_capture(room)).warnings)

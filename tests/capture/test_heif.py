@@ -127,7 +127,7 @@ def test_damage_anywhere_gives_a_picture_or_a_sentence(tmp_path: Path, data: st.
 def test_without_the_package_one_sentence_says_what_to_do(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     folder(tmp_path)
     monkeypatch.setitem(sys.modules, "pillow_heif", None)
-    with pytest.raises(InputError, match=r"IMG_0000\.HEIC is a HEIF image .* install pillow-heif|pip install pillow-heif"):
+    with pytest.raises(InputError, match=r"IMG_0000\.HEIC is a HEIF image .* .pip install \"fieldfuse\[heic\]\""):
         open_capture(tmp_path)
 
 

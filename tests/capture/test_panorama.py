@@ -52,7 +52,7 @@ def test_panoramas_are_recognised_by_what_they_show(tmp_path: Path) -> None:
     capture = open_capture(photos(tmp_path / "p", panoramas()))
     assert lenses(capture) == {EQUIRECTANGULAR} and not capture.posed
     assert warned(capture, "4 images are taken for 360° panoramas by what they show; --set capture.projection=perspective")
-    assert capture.extra[CUT] == "each of 4 360° pictures is cut into 7 views; 84% of what it shows is kept"
+    assert capture.extra[CUT] == "each of 4 360° images is cut into 7 views; 84% of what it shows is kept"
     assert lenses(open_capture(tmp_path / "p", projection="perspective")) == {None}
 
 

@@ -167,7 +167,7 @@ def captured(folder: Path, camera: Intrinsics, count: int = 4, posed: bool = Tru
 def test_a_posed_fisheye_capture_becomes_posed_views_with_masks_and_depth(tmp_path: Path) -> None:
     camera = fisheye(180, 320, 320)
     capture = captured(tmp_path, camera, depth=True)
-    assert capture.extra[CUT] == "each of 4 fisheye pictures is cut into 4 views; 98% of what it shows is kept"
+    assert capture.extra[CUT] == "each of 4 fisheye images is cut into 4 views; 98% of what it shows is kept"
     cut = cut_images(capture, tmp_path / "run", 2)
     assert len(cut.frames) == 16 and cut.posed and cut.has_depth and not to_cut(cut)
     assert capture_to_dict(capture_from_dict(capture_to_dict(cut))) == capture_to_dict(cut)

@@ -91,6 +91,6 @@ def test_what_cannot_be_written_is_refused_in_a_sentence(tmp_path: Path, monkeyp
     with pytest.raises(InputError, match="no coordinate reference system"):
         write_cloud(tmp_path / "a.e57", NORMALS, COLOURS, crs="nowhere")
     monkeypatch.setitem(sys.modules, "lazrs", None)
-    with pytest.raises(InputError, match=r'the format laz needs the extra `las`.*pip install "fieldfuse\[las\]"'):
+    with pytest.raises(InputError, match=r'the format laz needs the package l.* .pip install "fieldfuse\[las\]"'):
         write_cloud(tmp_path / "a.laz", NORMALS, COLOURS)
     assert not list(tmp_path.iterdir())

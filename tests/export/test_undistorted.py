@@ -75,7 +75,7 @@ def test_images_masks_and_models_of_every_program(posed: Capture, tmp_path: Path
         order = sorted(model.points3D)
         assert np.array_equal([model.points3D[i].xyz for i in order], POINTS)
         assert np.array_equal([model.points3D[i].color for i in order], COLOURS)
-    # nerfstudio 1.1.5: masks are there for all or none, and whoever names one split has to name all.
+    # nerfstudio 1.1.5: masks are there for all or none, and a file that names one split has to name all.
     data = json.loads((out / "transforms.json").read_text())
     assert data["camera_model"] == "OPENCV" and data["applied_transform"] == np.eye(4)[:3].tolist()
     assert data["test_filenames"] == data["val_filenames"] == ["images/a_one_x.png"] and len(data["train_filenames"]) == 3

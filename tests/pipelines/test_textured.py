@@ -61,7 +61,7 @@ def test_formats_of_other_programs_are_made_when_they_are_named(
     cloud, read = trimesh.load(out / "exports" / "points.ply", process=False), laspy.read(out / "exports" / "points.laz")
     assert np.abs(read.xyz - cloud.vertices).max() < 1e-5 and np.array_equal(np.asarray(read.red) // 257, cloud.colors[:, 0])
     said_so = " ".join(read_json(out / "report.json")["warnings"])
-    assert 'usdz was left out: the format usdz needs the extra `usd`, which is not installed: pip install "fieldfuse[usd]"' in said_so
+    assert 'usdz was left out: the format usdz needs the package pxr; install it (pip install "fieldfuse[usd]")' in said_so
     answer = call(capsys, "export", out, "--formats", "usdz", "--quiet")
     assert answer.code == 2 and answer.sentence().count("usdz") == 2
     monkeypatch.delitem(sys.modules, "pxr")

@@ -17,6 +17,7 @@ import numpy as np
 from fieldfuse.camera import Array
 from fieldfuse.capture.archive import read_bytes
 from fieldfuse.errors import InputError
+from fieldfuse.extras import extra
 
 SUFFIX = ".exr"
 FORMAT = "EXR"
@@ -173,14 +174,8 @@ def _one_map(stored: Array, path: Path) -> Array:
 
 def package(path: Path) -> Any:
     """The package that reads OpenEXR, for `path`."""
-    try:
-        import OpenEXR
-    except ImportError as error:
-        raise InputError(
-            f'{path} is OpenEXR, which needs the package OpenEXR; install it (pip install "fieldfuse[exr]"), or write depth as 16-bit PNG '
-            "in millimetres or as float .npy, and images as PNG or TIFF"
-        ) from error
-    return OpenEXR
+    otherwise = ", or write depth as 16-bit PNG in millimetres or as float .npy, and images as PNG or TIFF"
+    return extra("exr", "OpenEXR", f"{path} is OpenEXR, which", otherwise)
 
 
 @contextmanager

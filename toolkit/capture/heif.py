@@ -12,6 +12,7 @@ from PIL import Image
 
 from fieldfuse.camera import Array
 from fieldfuse.errors import InputError
+from fieldfuse.extras import extra
 
 SUFFIXES = (".heic", ".heif", ".hif")
 FORMAT = "HEIF"  # Pillow's name for it
@@ -34,14 +35,8 @@ def file_is_heif(path: Path) -> bool:
 
 def register(path: Path) -> None:
     """Let Pillow read HEIF, of which `path` is the first."""
-    try:
-        from pillow_heif import register_heif_opener
-    except ImportError as error:
-        raise InputError(
-            f"{path} is a HEIF image (.heic), which needs the package pillow-heif; install it (pip install pillow-heif), "
-            "or convert the images to JPEG"
-        ) from error
-    register_heif_opener()
+    package = extra("heic", "pillow_heif", f"{path} is a HEIF image (.heic), which", ", or convert the images to JPEG")
+    package.register_heif_opener()
 
 
 def decode(data: bytes, path: Path) -> Array:

@@ -25,7 +25,7 @@ from fieldfuse.capture.types import Capture, Frame
 from fieldfuse.errors import InputError
 from fieldfuse.progress import SILENT, Progress
 
-LIGHT = "light"  # in `Capture.extra`: what floating-point images hold by the user's word, "linear" or "display"
+LIGHT = "light"  # in `Capture.extra`: what floating-point images hold by the setting, "linear" or "display"
 SAMPLED, PIXELS = 24, 20_000  # images that the exposure is chosen by, evenly spread, and pixels of each
 JUDGED = 5  # floating-point images that are looked at for levels
 LEVEL, LEVELS = 0.02, 0.99  # how near to whole numbers values are that were levels, and how many of them
@@ -36,6 +36,7 @@ FLOAT_WHITES = (255, 1023, 4095, 16383, 65535)  # that floating-point values may
 WHOLE, BRIGHT, EVERY = 4.0, 90, 7  # they are where their 90th percentile, of every 7th that is not black, is as large as this
 ABOVE_ONE = 1e-3  # by which values may exceed 1 before that is worth a word
 FEWER_BITS = (1023, 4095, 16383)  # largest values of sensors that store 10, 12 and 14 bits in 16
+
 
 def with_white(capture: Capture, progress: Progress = SILENT) -> Capture:
     """The capture with `white`, `linear` and `balance` of its frames where these are not as usual, and with remarks on them. Itself for
@@ -53,7 +54,7 @@ def _linear_light(capture: Capture, progress: Progress) -> Capture:
     tiffs = [frame for frame in images if frame.image.suffix.lower() in TIFFS and frame.white is None]
     why = "OpenEXR"
     if tiffs and _is_floating(tiffs[0]) and (given or not floats):
-        judged = "by your word" if given == "linear" else _holds_linear(tiffs)
+        judged = "as capture.light has it" if given == "linear" else _holds_linear(tiffs)
         if judged:
             floats, why = [*floats, *tiffs], f"floating-point TIFF, {judged}"
     if given == "display":

@@ -17,6 +17,7 @@ from PIL import Image
 
 from fieldfuse.camera import Array
 from fieldfuse.errors import InputError
+from fieldfuse.extras import extra
 
 SUFFIXES = (".dng", ".cr2", ".cr3", ".nef", ".nrw", ".arw", ".raf", ".orf", ".rw2", ".pef", ".srw")
 FORMAT = "RAW"
@@ -87,14 +88,7 @@ def exif_of(path: Path) -> Image.Exif:
 
 def package(path: Path) -> Any:
     """The package that develops raw files, for `path`."""
-    try:
-        import rawpy
-    except ImportError as error:
-        raise InputError(
-            f'{path} is a camera raw file, which needs the package rawpy; install it (pip install "fieldfuse[raw]"), or develop the photos '
-            "to JPEG, all in the same way"
-        ) from error
-    return rawpy
+    return extra("raw", "rawpy", f"{path} is a camera raw file, which", ", or develop the photos to JPEG, all in the same way")
 
 
 @contextmanager

@@ -1,7 +1,7 @@
 """Views of a sphere: panoramas and fisheye images cut into overlapping pinhole images, as all later stages take them.
 
 The views of one image are one rig: they have one place and time, and their rotations to each other are known exactly, as their
-intrinsics are. Panoramas give a ring of six views of 90° and one straight up; what lies below is the tripod, or whoever holds the camera.
+intrinsics are. Panoramas give a ring of six views of 90° and one straight up; what lies below is the tripod, or the person with the camera.
 Of a fisheye lens as few views are cut as keep `ENOUGH` of what it shows.
 """
 
@@ -191,7 +191,7 @@ def announced(capture: Capture) -> Capture:
     numbers, kept = {len(views_of(camera)[0]) for camera in cameras}, min(views_of(camera)[1] for camera in set(cameras))
     lenses = {camera.lens for camera in cameras}
     kind = "wide" if len(lenses) > 1 else "360°" if EQUIRECTANGULAR in lenses else "fisheye"
-    many = counted(len(cameras), f"{kind} picture")
+    many = counted(len(cameras), f"{kind} image")
     into = " or ".join(str(number) for number in sorted(numbers))
     text = f"each of {many} is cut into {into} views; {100 * kept:.0f}% of what it shows is kept"
     return replace(capture, extra={**capture.extra, CUT: text})
@@ -226,7 +226,7 @@ def cut_images(capture: Capture, out: Path, threads: int, progress: Progress = S
         where = {folder / name: done.get(name) for name in names[index]}
         written = list(_cut(frames[index], capture, where, side, lit.get(image_header(frames[index].image).size)))
         finished += 1
-        progress.update(finished, len(indices), f"views of {finished} of {counted(len(indices), 'picture')}")
+        progress.update(finished, len(indices), f"views of {finished} of {counted(len(indices), 'image')}")
         return index, written
 
     largest = max((math.prod(image_header(frame.image).size) for frame in frames.values()), default=1)

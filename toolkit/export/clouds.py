@@ -14,6 +14,7 @@ from fieldfuse.camera import Array
 from fieldfuse.errors import InputError, OutputError, first_line
 from fieldfuse.export.extras import require
 from fieldfuse.files import atomic_path
+from fieldfuse.georeference import pyproj
 from fieldfuse.tsdf.mesh import as_bytes
 
 FINEST = 1e-6  # steps of LAS coordinates, whole numbers of 32 bits, are at most so much of the cloud's size
@@ -52,13 +53,10 @@ def write_cloud(path: Path | str, points: Array, colours: Array, normals: Array 
 
 
 def _crs(given: Any) -> Any:
+    proj = pyproj()
     try:
-        import pyproj
-    except ImportError as error:
-        raise InputError('reference systems need the extra `geo`, which is not installed: pip install "fieldfuse[geo]"') from error
-    try:
-        return pyproj.CRS.from_user_input(given)
-    except pyproj.exceptions.CRSError as error:
+        return proj.CRS.from_user_input(given)
+    except proj.exceptions.CRSError as error:
         raise InputError(f"{str(given)[:80]!r} is no coordinate reference system; give an EPSG code or WKT") from error
 
 

@@ -98,7 +98,7 @@ def _refined(start: Similarity, centres: Array, target: Array) -> tuple[Similari
             break
         fitted = _least_squares(fitted, centres[near], target[near], sigma)
     off = (fitted.points(centres) - target)[near]
-    free = max(1.0, 1 - 7 / (3 * max(near.sum(), 3)))
+    free = 1 - 7 / (3 * max(near.sum(), 3))  # seven numbers were fitted to three an image
     flat, up = np.sqrt((off[:, :2] ** 2).mean() / free), np.sqrt((off[:, 2] ** 2).mean() / free)
     return fitted, near, np.maximum([flat, flat, up], LEAST_NOISE)
 

@@ -21,6 +21,7 @@ from fieldfuse.measures import Marker
 from fieldfuse.poses.gps import similarity
 from fieldfuse.poses.intersect import Sights, meet
 from fieldfuse.progress import SILENT, Progress
+from fieldfuse.tone import LINEAR
 
 BOARD = -1  # the number of a board among single markers
 LEAST_CORNERS = 4  # of a board or marker, seen by two cameras each
@@ -108,7 +109,7 @@ def refined(grey: Array, corners: Array) -> Array | None:
     rim = int(MOST_MOVED + EDGE_MOST + 2)
     left, top = np.maximum(np.floor(corners.min(axis=0)).astype(int) - rim, 0)
     right, bottom = np.ceil(corners.max(axis=0)).astype(int) + rim + 1
-    light, origin = linear_light(grey[top:bottom, left:right]).astype(np.float32), np.array([left, top])
+    light, origin = LINEAR[grey[top:bottom, left:right]], np.array([left, top])
     lines = []
     for first, second in zip(corners, np.roll(corners, -1, axis=0), strict=True):
         along, length = second - first, float(np.linalg.norm(second - first))
@@ -146,12 +147,6 @@ def refined(grey: Array, corners: Array) -> Array | None:
         met.append(np.linalg.solve(normals, [lines[before][1], lines[after][1]]))
     found = np.array(met)
     return found if np.abs(found - corners).max() < MOST_MOVED else None
-
-
-def linear_light(grey: Array) -> Array:
-    """sRGB values 0 to 255 → linear light 0 to 1 (IEC 61966-2-1)."""
-    share = np.asarray(grey, dtype=np.float64) / 255
-    return np.where(share <= 0.04045, share / 12.92, ((share + 0.055) / 1.055) ** 2.4)
 
 
 def scale_by_markers(capture: Capture, marker: Marker, progress: Progress = SILENT) -> Sized:

@@ -16,7 +16,7 @@ from fieldfuse.render.image import View, make_renderer, render_view
 from fieldfuse.render.sky import on_sky
 from fieldfuse.threads import in_order
 
-SMOOTH = 8 / 255  # between pixels whose colours differ by less, the mean is as good: frames stay within 50 dB of whole renders
+SMOOTH = 8 / 255  # between pixels whose colours differ by less, the mean will do: frames are 47 to 60 dB from whole renders
 
 
 def film(field: Field, lenses: Sequence[Intrinsics], poses: Array, progress: Progress = SILENT) -> Iterator[Array]:

@@ -80,12 +80,12 @@ class Drawn(NamedTuple):
 
     Attributes:
         image: (H, W, 5) float32 red, green, blue on black; share of the light that is left; depth along z (0: none).
-        flat, ahead, places, entries, starts: see `backends.numba.splats`.
+        projected, ahead, places, entries, starts: see `backends.numba.splats`.
         across: tiles a row.
     """
 
     image: Array
-    flat: Array
+    projected: Array
     ahead: Array
     places: Array
     entries: Array
@@ -127,15 +127,15 @@ def draw(values: Array, lens: G.Lens) -> Drawn:
         InputError: so many are so large that their tiles do not fit into memory.
     """
     threads, count = torch.get_num_threads(), len(values)
-    flat, box = np.empty((count, G.FLAT), np.float32), np.empty((count, 4), np.int16)
-    share(lambda part: G.project_pass(values, lens, part.start, part.stop, flat, box), slices(count, PARTS * threads), threads)
+    projected, box = np.empty((count, G.PROJECTED), np.float32), np.empty((count, 4), np.int16)
+    share(lambda part: G.project_pass(values, lens, part.start, part.stop, projected, box), slices(count, PARTS * threads), threads)
     across, down = -(-lens.width // G.TILE), -(-lens.height // G.TILE)
     reached = (box[:, 1] - box[:, 0]).astype(np.int64) * (box[:, 3] - box[:, 2])
     ahead = np.concatenate([[0], np.cumsum(reached)])
     if ahead[-1] > MOST_ENTRIES:
         raise InputError(f"{count} Gaussians cover {ahead[-1]} tiles of this image, too many to draw; check their unit of length")
     seen = np.flatnonzero(reached)
-    order = seen[np.argsort(flat[seen, G.DEPTH], kind="stable")].astype(np.int32)
+    order = seen[np.argsort(projected[seen, G.DEPTH], kind="stable")].astype(np.int32)
     counts = np.zeros(across * down, np.int64)
     rows = slices(down, threads)
     share(lambda part: G.count_pass(order, box, across, part.start, part.stop, counts), rows, threads)
@@ -144,24 +144,24 @@ def draw(values: Array, lens: G.Lens) -> Drawn:
     share(lambda part: G.fill_pass(order, box, across, part.start, part.stop, begin, ahead, entries, places), rows, threads)
     image = np.empty((lens.height, lens.width, 5), np.float32)
     parts = slices(across * down, PARTS * threads)
-    share(lambda part: G.draw_pass(flat, entries, starts, across, part.start, part.stop, image), parts, threads)
-    return Drawn(image, flat, ahead, places, entries, starts, across)
+    share(lambda part: G.draw_pass(projected, entries, starts, across, part.start, part.stop, image), parts, threads)
+    return Drawn(image, projected, ahead, places, entries, starts, across)
 
 
-def pulled(drawn: Drawn, slope: Array) -> Array:
-    """What pixels ask of the Gaussians of each tile, for ∂L/∂ of the image; see `backends.numba.splats.pull_pass`."""
+def backward(drawn: Drawn, slope: Array) -> Array:
+    """Partial sums of the Gaussians of each tile, from ∂L/∂ of the image; see `backends.numba.splats.backward_pass`."""
     threads, tiles = torch.get_num_threads(), len(drawn.starts) - 1
-    pulls = np.empty((len(drawn.entries), G.PULLS), np.float32)
+    partials = np.empty((len(drawn.entries), G.PARTIALS), np.float32)
 
     def part(piece: slice) -> None:
-        G.pull_pass(drawn.flat, drawn.entries, drawn.starts, drawn.across, piece.start, piece.stop, slope, pulls)
+        G.backward_pass(drawn.projected, drawn.entries, drawn.starts, drawn.across, piece.start, piece.stop, slope, partials)
 
     share(part, slices(tiles, PARTS * threads), threads)
-    return pulls
+    return partials
 
 
 def gradient(values: Array, lens: G.Lens, drawn: Drawn, slope: Array) -> Array:
     """(N, 11 + 3 K) ∂L/∂ of the parameters."""
     out: Any = np.empty_like(values)
-    G.gradient_pass(values, lens, drawn.flat, drawn.ahead, drawn.places, pulled(drawn, slope), out)
+    G.gradient_pass(values, lens, drawn.projected, drawn.ahead, drawn.places, backward(drawn, slope), out)
     return out

@@ -30,7 +30,7 @@ from fieldfuse.render.composite import STOP, THRESHOLD
 from fieldfuse.render.field import Field
 from fieldfuse.render.numba_renderer import make_space, make_volume
 from fieldfuse.render.sky import sky_colours
-from fieldfuse.render.splats import PARTS, SH_0, Drawn, Splats, draw, make_lens, pulled
+from fieldfuse.render.splats import PARTS, SH_0, Drawn, Splats, backward, draw, make_lens
 from fieldfuse.threads import share, slices
 from fieldfuse.tone import exposed
 from fieldfuse.training.fit import Clock
@@ -357,8 +357,8 @@ def _slope(drawn: Drawn, image: Array, valid: Array | None, background: Array) -
 
 
 def _step(values: Array, lens: G.Lens, drawn: Drawn, slope: Array, state: G.Moments, rates: Array, sizes: Array) -> None:
-    threads, pulls = torch.get_num_threads(), pulled(drawn, slope)
-    known = (drawn.flat, drawn.ahead, drawn.places, pulls)
+    threads, partials = torch.get_num_threads(), backward(drawn, slope)
+    known = (drawn.projected, drawn.ahead, drawn.places, partials)
 
     def part(piece: slice) -> None:
         G.adam_pass(values, lens, *known, piece.start, piece.stop, state, rates, sizes)

@@ -33,8 +33,8 @@ CHECK = 16  # Gaussians after which a tile is looked at: whether any light is le
 MEAN, SCALE, ROTATION, OPACITY, HARMONICS = 0, 3, 6, 10, 11
 # Columns of a Gaussian in an image: centre, inverse covariance (A B; B C), opacity, colour, depth, half sides of the box around it.
 X, Y, A, B, C, PEAK, RED, GREEN, BLUE, DEPTH, WIDE, HIGH = range(12)
-FLAT = 12
-PULLS = 9  # sums over pixels of what a Gaussian gets from a tile
+PROJECTED = 12
+PARTIALS = 9  # sums over the pixels of a tile, for each Gaussian in it
 PIXELS = TILE * TILE
 LOG2E = F(1.4426950408889634)
 # 2^f for f from 0 to 1, Chebyshev's polynomial of degree 5: within 1.1e-7.
@@ -154,11 +154,11 @@ def _harmonics(values: Any, i: Any, lens: Any, basis: Any) -> Any:
 
 
 @njit(**K.OPTIONS)
-def project_pass(values: Any, lens: Any, first: Any, last: Any, flat: Any, box: Any) -> None:
+def project_pass(values: Any, lens: Any, first: Any, last: Any, projected: Any, box: Any) -> None:
     """Gaussians first … last - 1 of values (N, 11 + 3 · harmonics) as the camera sees them.
 
     Args:
-        flat: (N, FLAT) float32, written for what is seen.
+        projected: (N, PROJECTED) float32, written for what is seen.
         box: (N, 4) int16 tiles x0, x1, y0, y1 that a Gaussian reaches, ends excluded; nothing is seen where x0 = x1.
     """
     basis = np.empty((1, 16), np.float32)
@@ -188,9 +188,9 @@ def project_pass(values: Any, lens: Any, first: Any, last: Any, flat: Any, box: 
         box[i, 0], box[i, 1], box[i, 2], box[i, 3] = x0, x1, y0, y1
         red, green, blue = _harmonics(values, i, lens, basis)
         share = ONE / det
-        flat[i, X], flat[i, Y], flat[i, A], flat[i, B], flat[i, C] = mx, my, c * share, -b * share, a * share
-        flat[i, PEAK], flat[i, DEPTH], flat[i, WIDE], flat[i, HIGH] = peak, z, wide, high
-        flat[i, RED], flat[i, GREEN], flat[i, BLUE] = max(red, ZERO), max(green, ZERO), max(blue, ZERO)
+        projected[i, X], projected[i, Y], projected[i, A], projected[i, B], projected[i, C] = mx, my, c * share, -b * share, a * share
+        projected[i, PEAK], projected[i, DEPTH], projected[i, WIDE], projected[i, HIGH] = peak, z, wide, high
+        projected[i, RED], projected[i, GREEN], projected[i, BLUE] = max(red, ZERO), max(green, ZERO), max(blue, ZERO)
 
 
 @njit(**K.OPTIONS)
@@ -223,11 +223,11 @@ def fill_pass(order: Any, box: Any, across: Any, first: Any, last: Any, begin: A
 
 
 @njit(**K.INLINE)
-def _rows_and_columns(flat: Any, i: Any, left: Any, top: Any) -> Any:
+def _rows_and_columns(projected: Any, i: Any, left: Any, top: Any) -> Any:
     """Rows, and groups of `LANES` columns, of a tile that a Gaussian reaches: ends excluded."""
-    x, y = flat[i, X] - left, flat[i, Y] - top
-    y0, y1 = int(max(y - flat[i, HIGH], ZERO)), min(int(max(y + flat[i, HIGH], ZERO)) + 1, TILE)
-    x0, x1 = int(max(x - flat[i, WIDE], ZERO)) // LANES, min(int(max(x + flat[i, WIDE], ZERO)) // LANES + 1, TILE // LANES)
+    x, y = projected[i, X] - left, projected[i, Y] - top
+    y0, y1 = int(max(y - projected[i, HIGH], ZERO)), min(int(max(y + projected[i, HIGH], ZERO)) + 1, TILE)
+    x0, x1 = int(max(x - projected[i, WIDE], ZERO)) // LANES, min(int(max(x + projected[i, WIDE], ZERO)) // LANES + 1, TILE // LANES)
     return y0, y1, x0, x1
 
 
@@ -240,7 +240,7 @@ def _light_is_left(acc: Any) -> Any:
 
 
 @njit(**K.OPTIONS)
-def draw_pass(flat: Any, entries: Any, starts: Any, across: Any, first: Any, last: Any, image: Any) -> None:
+def draw_pass(projected: Any, entries: Any, starts: Any, across: Any, first: Any, last: Any, image: Any) -> None:
     """Tiles first … last - 1, composited: image (H, W, 5) red, green, blue, light left, and depth at which half of it is stopped."""
     height, width = image.shape[0], image.shape[1]
     acc = np.empty(5 * PIXELS, np.float32)
@@ -254,15 +254,15 @@ def draw_pass(flat: Any, entries: Any, starts: Any, across: Any, first: Any, las
             if (e - starts[tile]) % CHECK == CHECK - 1 and not _light_is_left(acc):
                 break
             i = entries[e]
-            y0, y1, x0, x1 = _rows_and_columns(flat, i, F(left), F(top))
-            a, b, c, peak, depth = flat[i, A], flat[i, B], flat[i, C], flat[i, PEAK], flat[i, DEPTH]
-            red, green, blue = flat[i, RED], flat[i, GREEN], flat[i, BLUE]
+            y0, y1, x0, x1 = _rows_and_columns(projected, i, F(left), F(top))
+            a, b, c, peak, depth = projected[i, A], projected[i, B], projected[i, C], projected[i, PEAK], projected[i, DEPTH]
+            red, green, blue = projected[i, RED], projected[i, GREEN], projected[i, BLUE]
             for y in range(y0, y1):
-                dy = F(top + y) + HALF - flat[i, Y]
+                dy = F(top + y) + HALF - projected[i, Y]
                 across_row, square = b * dy, HALF * c * dy * dy
                 for group in range(x0, x1):
                     base = np.uintp(y * TILE + group * LANES)
-                    dx0 = F(left + group * LANES) + HALF - flat[i, X]
+                    dx0 = F(left + group * LANES) + HALF - projected[i, X]
                     for lane in range(LANES):
                         pixel = base + np.uintp(lane)
                         dx = dx0 + F(np.int32(lane))
@@ -286,14 +286,14 @@ def draw_pass(flat: Any, entries: Any, starts: Any, across: Any, first: Any, las
 
 
 @njit(**K.OPTIONS)
-def pull_pass(flat: Any, entries: Any, starts: Any, across: Any, first: Any, last: Any, slope: Any, pulls: Any) -> None:
-    """What the pixels of tiles first … last - 1 ask of Gaussians.
+def backward_pass(projected: Any, entries: Any, starts: Any, across: Any, first: Any, last: Any, slope: Any, partials: Any) -> None:
+    """∂L/∂ of what each Gaussian is in the image, by the pixels of tiles first … last - 1.
 
     Front to back a second time: behind a Gaussian is the whole sum less what has been passed.
 
     Args:
         slope: (H, W, 4) ∂L/∂ of red, green and blue, and Σ of these times the image's colour, with what shines through from behind.
-        pulls: (E, PULLS): Σ q, Σ q dx, Σ q dy, Σ q dx², Σ q dx dy, Σ q dy² with q = −α ∂L/∂α, and ∂L/∂ of red, green and blue.
+        partials: (E, PARTIALS): Σ q, Σ q dx, Σ q dy, Σ q dx², Σ q dx dy, Σ q dy² with q = −α ∂L/∂α, and ∂L/∂ of red, green and blue.
     """
     height, width = slope.shape[0], slope.shape[1]
     acc = np.zeros(5 * PIXELS, np.float32)  # light left, what is still behind, slopes
@@ -310,21 +310,21 @@ def pull_pass(flat: Any, entries: Any, starts: Any, across: Any, first: Any, las
         lit = True
         for e in range(starts[tile], starts[tile + 1]):
             s0 = s1 = s2 = s3 = s4 = s5 = ZERO
-            pull_r = pull_g = pull_b = ZERO
+            d_red = d_green = d_blue = ZERO
             if (e - starts[tile]) % CHECK == CHECK - 1:
                 lit = lit and _light_is_left(acc)
             if lit:
                 i = entries[e]
-                y0, y1, x0, x1 = _rows_and_columns(flat, i, F(left), F(top))
-                a, b, c, peak = flat[i, A], flat[i, B], flat[i, C], flat[i, PEAK]
-                red, green, blue = flat[i, RED], flat[i, GREEN], flat[i, BLUE]
+                y0, y1, x0, x1 = _rows_and_columns(projected, i, F(left), F(top))
+                a, b, c, peak = projected[i, A], projected[i, B], projected[i, C], projected[i, PEAK]
+                red, green, blue = projected[i, RED], projected[i, GREEN], projected[i, BLUE]
                 for y in range(y0, y1):
-                    dy = F(top + y) + HALF - flat[i, Y]
+                    dy = F(top + y) + HALF - projected[i, Y]
                     across_row, square = b * dy, HALF * c * dy * dy
                     q0 = q1 = q2 = ZERO
                     for group in range(x0, x1):
                         base = np.uintp(y * TILE + group * LANES)
-                        dx0 = F(left + group * LANES) + HALF - flat[i, X]
+                        dx0 = F(left + group * LANES) + HALF - projected[i, X]
                         for lane in range(LANES):
                             pixel = base + np.uintp(lane)
                             dx = dx0 + F(np.int32(lane))
@@ -338,32 +338,32 @@ def pull_pass(flat: Any, entries: Any, starts: Any, across: Any, first: Any, las
                             own = red * gr + green * gg + blue * gb
                             behind -= weight * own
                             acc[pixel], acc[pixel + np.uintp(PIXELS)] = light - weight, behind
-                            pull = alpha * (behind / (ONE - alpha) - light * own)
-                            pull = pull if full < OPAQUEST else ZERO
-                            q0 += pull
-                            q1 += pull * dx
-                            q2 += pull * dx * dx
-                            pull_r += weight * gr
-                            pull_g += weight * gg
-                            pull_b += weight * gb
+                            q = alpha * (behind / (ONE - alpha) - light * own)  # −α ∂L/∂α
+                            q = q if full < OPAQUEST else ZERO
+                            q0 += q
+                            q1 += q * dx
+                            q2 += q * dx * dx
+                            d_red += weight * gr
+                            d_green += weight * gg
+                            d_blue += weight * gb
                     s0 += q0
                     s1 += q1
                     s2 += q0 * dy
                     s3 += q2
                     s4 += q1 * dy
                     s5 += q0 * dy * dy
-            pulls[e, 0], pulls[e, 1], pulls[e, 2], pulls[e, 3], pulls[e, 4], pulls[e, 5] = s0, s1, s2, s3, s4, s5
-            pulls[e, 6], pulls[e, 7], pulls[e, 8] = pull_r, pull_g, pull_b
+            partials[e, 0], partials[e, 1], partials[e, 2], partials[e, 3], partials[e, 4], partials[e, 5] = s0, s1, s2, s3, s4, s5
+            partials[e, 6], partials[e, 7], partials[e, 8] = d_red, d_green, d_blue
 
 
 @njit(**K.LEAF)
-def _gradient(values: Any, i: Any, lens: Any, flat: Any, pull: Any, basis: Any, out: Any) -> None:
-    """∂L/∂ of Gaussian `i`'s parameters into out (11 + 3 · harmonics,), from its summed `pull` (PULLS,)."""
-    a, b, c, peak = flat[i, A], flat[i, B], flat[i, C], flat[i, PEAK]
-    s0, s1, s2 = pull[0], pull[1], pull[2]
+def _gradient(values: Any, i: Any, lens: Any, projected: Any, summed: Any, basis: Any, out: Any) -> None:
+    """∂L/∂ of Gaussian `i`'s parameters into out (11 + 3 · harmonics,), from the sums over all pixels (PARTIALS,)."""
+    a, b, c, peak = projected[i, A], projected[i, B], projected[i, C], projected[i, PEAK]
+    s0, s1, s2 = summed[0], summed[1], summed[2]
     out[OPACITY] = -s0 * (ONE - peak)  # −Σ q / o · o (1 − o)
     # Through the inverse covariance: ∂L/∂Σ' = −Σ'⁻¹ (∂L/∂Σ'⁻¹) Σ'⁻¹.
-    d_a, d_b, d_c = HALF * pull[3], HALF * pull[4], HALF * pull[5]
+    d_a, d_b, d_c = HALF * summed[3], HALF * summed[4], HALF * summed[5]
     p00, p01, p10, p11 = a * d_a + b * d_b, a * d_b + b * d_c, b * d_a + c * d_b, b * d_b + c * d_c
     g00, g01, g11 = -(p00 * a + p01 * b), -(p00 * b + p01 * c), -(p10 * b + p11 * c)
     x, y, z = _in_camera(values, i, lens)
@@ -413,7 +413,7 @@ def _gradient(values: Any, i: Any, lens: Any, flat: Any, pull: Any, basis: Any, 
     for j in range(3):
         out[MEAN + j] = r[0, j] * dx + r[1, j] * dy + r[2, j] * dz
     red, green, blue = _harmonics(values, i, lens, basis)
-    red, green, blue = pull[6] if red > ZERO else ZERO, pull[7] if green > ZERO else ZERO, pull[8] if blue > ZERO else ZERO
+    red, green, blue = summed[6] if red > ZERO else ZERO, summed[7] if green > ZERO else ZERO, summed[8] if blue > ZERO else ZERO
     for k in range((values.shape[1] - HARMONICS) // 3):
         out[HARMONICS + 3 * k] = basis[0, k] * red
         out[HARMONICS + 3 * k + 1] = basis[0, k] * green
@@ -421,26 +421,26 @@ def _gradient(values: Any, i: Any, lens: Any, flat: Any, pull: Any, basis: Any, 
 
 
 @njit(**K.LEAF)
-def _summed(ahead: Any, i: Any, places: Any, pulls: Any, out: Any) -> None:
-    """What all tiles ask of Gaussian `i`, in the order of the tiles."""
-    for k in range(PULLS):
+def _summed(ahead: Any, i: Any, places: Any, partials: Any, out: Any) -> None:
+    """The partial sums of all tiles for Gaussian `i`, in the order of the tiles."""
+    for k in range(PARTIALS):
         out[k] = ZERO
     for entry in range(ahead[i], ahead[i + 1]):
         place = places[entry]
-        for k in range(PULLS):
-            out[k] += pulls[place, k]
+        for k in range(PARTIALS):
+            out[k] += partials[place, k]
 
 
 @njit(**K.OPTIONS)
-def gradient_pass(values: Any, lens: Any, flat: Any, ahead: Any, places: Any, pulls: Any, out: Any) -> None:
+def gradient_pass(values: Any, lens: Any, projected: Any, ahead: Any, places: Any, partials: Any, out: Any) -> None:
     """∂L/∂ of all parameters into out (N, 11 + 3 · harmonics); zero for what is not seen."""
-    basis, pull = np.empty((1, 16), np.float32), np.empty(PULLS, np.float32)
+    basis, summed = np.empty((1, 16), np.float32), np.empty(PARTIALS, np.float32)
     for i in range(len(values)):
         if ahead[i + 1] == ahead[i]:
             out[i] = ZERO
             continue
-        _summed(ahead, i, places, pulls, pull)
-        _gradient(values, i, lens, flat, pull, basis, out[i])
+        _summed(ahead, i, places, partials, summed)
+        _gradient(values, i, lens, projected, summed, basis, out[i])
 
 
 class Moments(NamedTuple):
@@ -453,7 +453,17 @@ class Moments(NamedTuple):
 
 @njit(**K.OPTIONS)
 def adam_pass(
-    values: Any, lens: Any, flat: Any, ahead: Any, places: Any, pulls: Any, first: Any, last: Any, moments: Any, rates: Any, sizes: Any
+    values: Any,
+    lens: Any,
+    projected: Any,
+    ahead: Any,
+    places: Any,
+    partials: Any,
+    first: Any,
+    last: Any,
+    moments: Any,
+    rates: Any,
+    sizes: Any,
 ) -> None:
     """A step of Adam (β 0.9, 0.99) for those of the Gaussians first … last - 1 that are seen.
 
@@ -461,13 +471,13 @@ def adam_pass(
         rates: (P,) float32; those of the places are in shares of sizes (N,).
     """
     parameters = values.shape[1]
-    basis, pull, out = np.empty((1, 16), np.float32), np.empty(PULLS, np.float32), np.empty(parameters, np.float32)
+    basis, summed, out = np.empty((1, 16), np.float32), np.empty(PARTIALS, np.float32), np.empty(parameters, np.float32)
     one, two, steps = moments
     for i in range(first, last):
         if ahead[i + 1] == ahead[i]:
             continue
-        _summed(ahead, i, places, pulls, pull)
-        _gradient(values, i, lens, flat, pull, basis, out)
+        _summed(ahead, i, places, partials, summed)
+        _gradient(values, i, lens, projected, summed, basis, out)
         steps[i] = min(int(steps[i]) + 1, 65535)
         count = F(steps[i])
         scale1, scale2 = ONE / (ONE - F(math.exp(count * LN_FIRST))), ONE / (ONE - F(math.exp(count * LN_SECOND)))
