@@ -121,7 +121,7 @@ def see_through(capture: Capture) -> str | None:
         with suppress(InputError):
             image = load_image(frame)
             shares.append(float((image[..., 3] < 128).mean()) if image.shape[2] == 4 else 0.0)
-    return f"cuts {100 * np.mean(shares or [0.0]):.0f}% of the images away (by {len(shares)} of {len(capture.frames)})"
+    return f"{100 * np.mean(shares or [0.0]):.0f}% of the pixels are transparent (by {len(shares)} of {len(capture.frames)} images)"
 
 
 def check_poses(capture: Capture, progress: Progress) -> tuple[str | None, list[str]]:

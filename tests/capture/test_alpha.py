@@ -111,4 +111,4 @@ def test_info_says_how_much_alpha_cuts_away(tmp_path: Path) -> None:
         pixels[:, :40, 3] = 0
         pixels[:, :, 0] = 60 * index
         cv2.imwrite(str(tmp_path / f"{index}.png"), pixels)
-    assert see_through(open_capture(tmp_path)) == "cuts 80% of the images away (by 3 of 3)"
+    assert see_through(open_capture(tmp_path)) == "80% of the pixels are transparent (by 3 of 3 images)"
