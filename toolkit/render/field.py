@@ -45,6 +45,8 @@ class Field:
         near: distance before which nothing is sampled.
         sky: (9, 3) harmonics of the colour behind everything, which whole renders show instead of `background`; None: there is none. It
             stays on the CPU, where renders are put together.
+        outer: a coarser field of the same space and decoder, which is sampled where this one has no voxel, and never trained: the rest of a
+            scene while one cell of it is fitted. Compiled engines of the CPU alone know it; it is not saved.
     """
 
     space: Space
@@ -58,6 +60,7 @@ class Field:
     near: float = 0.0
     fine: int = 4
     sky: Tensor | None = None
+    outer: Field | None = None
 
     def __post_init__(self) -> None:
         self.grid = MarchGrid(self.space, self.resolution, self.topology, self.occupied)

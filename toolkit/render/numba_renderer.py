@@ -17,6 +17,7 @@ from fieldfuse.threads import share
 from fieldfuse.volume.topology import VOXELS
 
 Tensor = torch.Tensor
+Array = np.ndarray[Any, Any]
 FARTHEST = 15  # bricks; distances are capped here
 PIECE = 4096  # rays that a thread takes at a time
 
@@ -42,14 +43,39 @@ def make_space(field: Field) -> K.Space:
 
 def make_volume(field: Field) -> K.Volume:
     """The field's arrays; densities and features are the field's own memory, so what a fit changes is seen here at once."""
+    filled = field.grid.bricks.numpy() > 0
+    if field.outer is None:
+        none = np.empty((0, 1), np.float32)
+        rows = np.empty((0, 8), np.uint64), np.empty((0, 8), np.int32), none[:, 0], none
+        outer = K.Outer(np.empty((0, 0, 0), np.int32), *rows, 0, 0, 0, np.float32(0))
+    else:
+        around, origin = field.outer, (int(c) for c in field.outer.topology.table_origin)
+        outer = K.Outer(*_arrays(around), *origin, np.float32(around.resolution / field.resolution))
+        filled = filled | _on_finer_bricks(around.grid.bricks.numpy() > 0, len(filled))
+    bricks = np.where(filled, np.uint8(0), np.uint8(FARTHEST))
+    chessboard_distance(bricks, FARTHEST)
+    table, *rest = _arrays(field)
+    return K.Volume(table, bricks, *rest, outer)
+
+
+def _arrays(field: Field) -> tuple[Array, Array, Array, Array, Array]:
+    """Table, bits, upper, density and feature of `common.Volume`."""
     topology = field.topology
     upper = topology.around[:, [13, 14, 16, 17, 22, 23, 25, 26]]
     upper = torch.where(upper < 0, topology.blocks, upper).to(torch.int32).contiguous()
-    bricks = np.where(field.grid.bricks.numpy() > 0, np.uint8(0), np.uint8(FARTHEST))
-    chessboard_distance(bricks, FARTHEST)
     bits = np.packbits(field.occupied.numpy().reshape(-1, VOXELS), axis=1, bitorder="little").view(np.uint64)
-    rows = field.density_rows.detach().numpy(), field.feature_rows.detach().numpy()
-    return K.Volume(topology.table.numpy(), bricks, bits, upper.numpy(), *rows)
+    return topology.table.numpy(), bits, upper.numpy(), field.density_rows.detach().numpy(), field.feature_rows.detach().numpy()
+
+
+def _on_finer_bricks(filled: Array, width: int) -> Array:
+    """(B, B, B) bool bricks of a lattice, with a margin of one → those of a finer one, (width,) × 3, that touch any of them."""
+    ratio = (len(filled) - 2) / (width - 2)
+    place = np.arange(width) - 1
+    low, high = np.floor(place * ratio).astype(int) + 1, np.ceil((place + 1) * ratio).astype(int)
+    low, high = (np.clip(ends, 0, len(filled) - 1) for ends in (low, high))
+    for axis in range(3):
+        filled = np.take(filled, low, axis) | np.take(filled, high, axis)
+    return filled
 
 
 class NumbaRenderer:

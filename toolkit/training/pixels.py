@@ -15,6 +15,7 @@ device; compiled twins are in `backends/numba/train_batch.py`.
 from __future__ import annotations
 
 import zlib
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import cv2
@@ -102,6 +103,27 @@ class PixelPool:
 
     def __len__(self) -> int:
         return len(self.colour)
+
+    def some(self, picks: Tensor) -> PixelPool:
+        """A pool of its own with the pixels `picks` (P,), ascending, and the views that have any of them."""
+        view, row, column = self.seen_at(picks)
+        kept, counts = view.unique_consecutive(return_counts=True)
+        places = (row * self.camera[view, 4].long() + column).int()
+        distance = self.distance[picks] if len(self.distance) else self.distance
+        starts = torch.cat([counts.new_zeros(1), counts.cumsum(0)])
+        return PixelPool.of((self.colour[picks], places, starts, distance, self.camera[kept], self.pose[kept]), self.height)
+
+    @classmethod
+    def of(cls, arrays: Sequence[Tensor], height: int) -> PixelPool:
+        """A pool of the tensors that `arrays` gives; `height`: pixels of the tallest image."""
+        pool = cls.__new__(cls)
+        pool.colour, pool.places, pool.starts, pool.distance, pool.camera, pool.pose = arrays
+        pool.height, pool.limit = height, len(pool.colour)
+        return pool
+
+    def arrays(self) -> dict[str, Tensor]:
+        """The tensors of the pool by name, in the order that `of` takes them."""
+        return {name: getattr(self, name) for name in ("colour", "places", "starts", "distance", "camera", "pose")}
 
     def seen_at(self, pick: Tensor) -> tuple[Tensor, Tensor, Tensor]:
         """(B,) pixels → (B,) int64 views, rows and columns."""

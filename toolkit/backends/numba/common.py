@@ -110,15 +110,30 @@ class Space(NamedTuple):
     width: Any  # tuple with an entry a channel: its length is known to the compiler, which then unrolls
 
 
+class Outer(NamedTuple):
+    """A frozen, coarser field that is sampled where the volume's own voxels are none (`Field.outer`); without one its table is empty."""
+
+    table: Any  # these five as in `Volume`
+    bits: Any
+    upper: Any
+    density: Any
+    feature: Any
+    ox: Any  # table origin, ints
+    oy: Any
+    oz: Any
+    shrink: Any  # its voxels to one of the volume's, below 1
+
+
 class Volume(NamedTuple):
     """Arrays of a field, all of them views of the field's own tensors but `bits`, `bricks` and `upper`."""
 
     table: Any  # (Sz, Sy, Sx) int32 slot or −1
-    bricks: Any  # (B, B, B) uint8 distance in bricks to the nearest occupied brick, with a margin of one
+    bricks: Any  # (B, B, B) uint8 distance in bricks to the nearest occupied brick (the outer field's, too), with a margin of one
     bits: Any  # (M, 8) uint64 occupancy, one word a z-slice
     upper: Any  # (M, 8) int32 blocks at +x, +y, +z combinations, bit 0 x, bit 1 y, bit 2 z; M where absent
     density: Any  # (M · 512 + 1,) float32
     feature: Any  # (M · 512 + 1, C) float32
+    outer: Any  # Outer
 
 
 class Decoder(NamedTuple):

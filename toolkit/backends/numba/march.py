@@ -55,7 +55,7 @@ class Step(NamedTuple):
 class Samples(NamedTuple):
     """Samples of some rays whose weight exceeds a threshold, a row a sample."""
 
-    cells: Any  # (S,) int32
+    cells: Any  # (S,) int32; −1 − cell of a voxel of the outer field
     rows: Any  # (S, 8) int32 lattice corners
     values: Any  # (S, VALUES) float32
 
@@ -192,6 +192,12 @@ def block_slot(space: Any, table: Any, x: Any, y: Any, z: Any) -> Any:
     return np.int64(-1)
 
 
+@njit(**K.INLINE)
+def is_set(bits: Any, slot: Any, x: Any, y: Any, z: Any) -> Any:
+    """Whether the voxel at lattice place (x, y, z) of block `slot` is occupied."""
+    return (bits[np.uintp(slot), np.uintp(z & 7)] >> np.uint64((y & 7) * 8 + (x & 7))) & np.uint64(1) != 0
+
+
 @njit(**K.LEAF)
 def march_ray(
     space: Any, volume: Any, line: Any, jitter: Any, stop: Any, threshold: Any, marks: Any, first: Any, samples: Any, result: Any
@@ -214,7 +220,7 @@ def march_ray(
     per_fine, unit = ONE / F(fine), space.voxel * F(4) / (TWO * space.extent)
     cells, all_rows, values = samples
     table, bits, density, upper, feature = volume.table, volume.bits, volume.density, volume.upper, volume.feature
-    marking = marks.shape[0] > 0
+    outer, marking, surrounded = volume.outer, marks.shape[0] > 0, volume.outer.table.shape[0] > 0
     kept, looked, walked = first, 0, 0
     depth, median = ZERO, ZERO  # optical depth so far
     transmittance = ONE
@@ -238,15 +244,24 @@ def march_ray(
             if tx != lx or ty != ly or tz != lz:
                 lx, ly, lz = tx, ty, tz
                 slot = block_slot(space, table, tx, ty, tz)
-            if slot < 0:
+            own = slot >= 0 and is_set(bits, slot, i, j, k)
+            if own:
+                cell = slot * 512 + ((k & 7) * 8 + (j & 7)) * 8 + (i & 7)
+                if marking:
+                    K.prefetch(marks, np.int64(cell))
+                fx, fy, fz = x - F(i), y - F(j), z - F(k)
+                raw = raw_density(density, upper, cell, fx, fy, fz)
+            elif surrounded:
+                x, y, z = x * outer.shrink, y * outer.shrink, z * outer.shrink
+                i, j, k = int(x), int(y), int(z)
+                around = block_slot(space, outer.table, (i >> 3) - outer.ox, (j >> 3) - outer.oy, (k >> 3) - outer.oz)
+                if around < 0 or not is_set(outer.bits, around, i, j, k):
+                    continue
+                cell = around * 512 + ((k & 7) * 8 + (j & 7)) * 8 + (i & 7)
+                fx, fy, fz = x - F(i), y - F(j), z - F(k)
+                raw = raw_density(outer.density, outer.upper, cell, fx, fy, fz)
+            else:
                 continue
-            if (bits[np.uintp(slot), np.uintp(k & 7)] >> np.uint64((j & 7) * 8 + (i & 7))) & np.uint64(1) == 0:
-                continue
-            cell = slot * 512 + ((k & 7) * 8 + (j & 7)) * 8 + (i & 7)
-            if marking:
-                K.prefetch(marks, np.int64(cell))
-            fx, fy, fz = x - F(i), y - F(j), z - F(k)
-            raw = raw_density(density, upper, cell, fx, fy, fz)
             tau = math.exp(min(raw, K.RAW_MAX)) * K.UNITS * length
             looked += 1
             depth += tau
@@ -255,24 +270,31 @@ def march_ray(
             if transmittance > HALF and after <= HALF:
                 median = (step.begin + span * (F(index) + half_way(transmittance, after)) * per_fine) * half
             if marking:
-                mark(marks, cell, weight)
+                if own:
+                    mark(marks, cell, weight)
                 if weight > strongest:
-                    strongest, strongest_cell = weight, cell
+                    strongest, strongest_cell = weight, cell if own else np.int64(-1)
             if weight > threshold and kept < cells.shape[0]:
-                cells[kept] = cell
-                corner_rows(upper, cell, all_rows, kept)
                 values[kept, K.X], values[kept, K.Y], values[kept, K.Z] = fx, fy, fz
                 values[kept, K.RAW], values[kept, K.TAU] = raw, tau
                 values[kept, K.WEIGHT], values[kept, K.AFTER] = weight, after
                 values[kept, K.PLACE] = (F(step.index) + where) * unit
                 values[kept, K.ALONG] = (step.begin + span * where) * half
-                for corner in range(8):
-                    K.prefetch(feature, np.int64(all_rows[kept, corner]))
+                if own:
+                    cells[kept] = cell
+                    corner_rows(upper, cell, all_rows, kept)
+                    for corner in range(8):
+                        K.prefetch(feature, np.int64(all_rows[kept, corner]))
+                else:
+                    cells[kept] = -1 - cell
+                    corner_rows(outer.upper, cell, all_rows, kept)
+                    for corner in range(8):
+                        K.prefetch(outer.feature, np.int64(all_rows[kept, corner]))
                 kept += 1
             transmittance = after
             if transmittance < stop:
                 break
-    if marking and transmittance < K.SOLID:
+    if marking and transmittance < K.SOLID and strongest_cell >= 0:
         mark_surface(marks, strongest_cell)
     result[0], result[1], result[2], result[3] = median, transmittance, F(looked), F(walked)
     return kept

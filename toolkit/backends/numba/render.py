@@ -21,7 +21,7 @@ ROOM = 2 * K.MOST_KEPT  # samples of all rays that are decoded together
 
 @njit(**K.INLINE)
 def mean_feature(
-    space: Any, feature: Any, samples: Any, first: Any, last: Any, weights: Any, features: Any, mean: Any, ahead: Any
+    space: Any, volume: Any, samples: Any, first: Any, last: Any, weights: Any, features: Any, mean: Any, ahead: Any
 ) -> Any:
     """Features of samples first … last - 1 of a ray, their weighted sum in `mean` (C,) → opacity.
 
@@ -34,8 +34,11 @@ def mean_feature(
         mean[c] = K.ZERO
     opacity = K.ZERO
     for i in range(first, last):
-        gather_row(space.width, feature, rows, values, weights, features, i)
-        if ahead.shape[0] > 0:
+        if samples.cells[i] < 0:
+            gather_row(space.width, volume.outer.feature, rows, values, weights, features, i)
+        else:
+            gather_row(space.width, volume.feature, rows, values, weights, features, i)
+        if ahead.shape[0] > 0 and samples.cells[i] >= 0:
             for corner in range(8):
                 K.prefetch(ahead, np.int64(rows[i, corner]))
         weight = values[i, K.WEIGHT]
@@ -61,7 +64,7 @@ def render_pass(
             dx, dy, dz = directions[ray, 0], directions[ray, 1], directions[ray, 2]
             line = origins[ray, 0], origins[ray, 1], origins[ray, 2], dx, dy, dz
             kept = march_ray(space, volume, line, K.ZERO, stop, threshold, marks, K.START, samples, result)
-            opacity = mean_feature(space, volume.feature, samples, K.START, kept, weights, features, mean, ahead)
+            opacity = mean_feature(space, volume, samples, K.START, kept, weights, features, mean, ahead)
             share = K.ONE / max(opacity, K.F(1e-6))
             for c in range(channels):
                 given[one, c] = mean[c] * share
@@ -107,7 +110,7 @@ def project_back_pass(
                 opacity += values[i, K.WEIGHT]
             if opacity < K.SOLID:
                 continue
-            mean_feature(space, volume.feature, samples, first, last, weights, features, mean, sums)
+            mean_feature(space, volume, samples, first, last, weights, features, mean, sums)
             for c in range(channels):
                 given[count, c] = mean[c] / opacity
             encode_direction(dx, dy, dz, given, count, channels)

@@ -106,7 +106,7 @@ def _composite(space: Any, volume: Any, index: Any, block: Any, count: Any) -> N
     channels, given, mean, starts = len(space.width), block.tape.given, block.g_mean, block.starts
     for one in range(count):
         first, last = starts[one], starts[one + 1]
-        opacity = mean_feature(space, volume.feature, block.samples, first, last, block.weights, block.features, mean, index)
+        opacity = mean_feature(space, volume, block.samples, first, last, block.weights, block.features, mean, index)
         block.opacity[one] = opacity
         scale = ONE / max(opacity, F(1e-6))
         for c in range(channels):
@@ -170,6 +170,8 @@ def _to_lattice(
             weight = values[i, K.WEIGHT]
             g_raw = (values[i, K.AFTER] * g_weight[i] - behind) * values[i, K.TAU] if values[i, K.RAW] < K.RAW_MAX else ZERO
             behind += weight * g_weight[i]
+            if block.samples.cells[i] < 0:  # of the outer field, which stays as it is
+                continue
             slow = near_scale(values[i, K.ALONG], losses.slow_within)
             g_raw *= slow
             weight *= slow

@@ -1,0 +1,85 @@
+"""The cells' fields as one: every block comes from the cell that owns it."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+import torch
+
+from fieldfuse.errors import FieldfuseError
+from fieldfuse.render.field import Field
+from fieldfuse.training.cells.partition import Cells
+from fieldfuse.volume.edit import corner_nodes
+from fieldfuse.volume.host import plain_rows
+from fieldfuse.volume.topology import VOXELS, Topology
+
+Array = np.ndarray[Any, Any]
+
+
+class NotCoveredError(FieldfuseError):
+    """A part of the scene is missing from what the cells gave."""
+
+
+def merged(coarse: Field, cells: Cells, fields: Sequence[Field]) -> Field:
+    """One field of those of all cells, each with the halo that it was fitted with.
+
+    A corner of a voxel that lies on a border belongs to the block it lies in, and so to that block's owner; where the owner has no use for
+    it (its own voxels there are empty), the neighbour's value stays.
+
+    Raises:
+        NotCoveredError: a cell is missing.
+    """
+    if len(fields) != cells.count:
+        raise NotCoveredError(f"{len(fields)} of {cells.count} cells were fitted; start the run again, and it fits the others")
+    resolution = fields[0].resolution
+    ratio = resolution // coarse.resolution
+    keys = torch.from_numpy(np.unique(np.concatenate([field.topology.keys.numpy() for field in fields]), axis=0))
+    topology = Topology(keys)
+    rows = plain_rows(topology, fields[0].feature_rows.shape[1])
+    occupied = torch.zeros(topology.zero_row, dtype=torch.bool)
+    owner = cells.owner_of(keys.numpy(), ratio)
+    for owned in (False, True):  # what a cell owns is written last
+        for index, field in enumerate(fields):
+            slots = topology.find(field.topology.keys)
+            mine = torch.from_numpy(owner[slots.numpy()] == index)
+            used = (corner_nodes(field.topology, field.occupied).view(-1, VOXELS) & (mine == owned)[:, None]).nonzero()
+            source, target = used[:, 0] * VOXELS + used[:, 1], slots[used[:, 0]] * VOXELS + used[:, 1]
+            rows.density[target], rows.feature[target] = field.density_rows[source], field.feature_rows[source]
+            if owned:
+                inside = slots[mine][:, None] * VOXELS + torch.arange(VOXELS)
+                occupied[inside] = field.occupied.view(-1, VOXELS)[mine]
+    values = {"topology": topology, "occupied": occupied, "density_rows": rows.density, "feature_rows": rows.feature}
+    return replace(coarse, resolution=resolution, **values).settled()
+
+
+def check_coverage(coarse: Field, seen: Array, cells: Cells, result: Field) -> list[str]:
+    """Every block of the coarse field that training rays saw has to be there in the result.
+
+    Args:
+        seen: (M,) rays that saw each block of the coarse field.
+
+    Returns:
+        a sentence where single blocks were found empty by their cell.
+
+    Raises:
+        NotCoveredError: a cell that rays saw holds nothing.
+    """
+    ratio = result.resolution // coarse.resolution
+    filled = result.topology.keys[result.occupied.view(-1, VOXELS).any(1)]
+    slots = coarse.topology.find(torch.div(filled, ratio, rounding_mode="floor")).numpy()
+    there = np.zeros(coarse.blocks, bool)
+    there[slots[slots >= 0]] = True
+    for cell in range(cells.count):
+        own = (cells.owner == cell) & (seen > 0)
+        if own.any() and not there[own].any():
+            raise NotCoveredError(
+                f"cell {cell} of {cells.count} holds nothing, though training rays end in {own.sum()} of its blocks; please report this"
+            )
+    lost = (seen > 0) & ~there
+    if not lost.any():
+        return []
+    share = seen[lost].sum() / seen.sum()
+    return [f"cells: {lost.sum()} of {(seen > 0).sum()} blocks that the coarse field has ({share:.1%} of the rays) were found to be empty"]
