@@ -18,6 +18,7 @@ from fieldfuse.evaluation.pictures import depth_picture, depth_range
 from fieldfuse.evaluation.score import nearest_image_scores, score_views, seen_share, training_psnr
 from fieldfuse.files import fingerprint, write_json
 from fieldfuse.memory import require_scores
+from fieldfuse.pipelines.cells import fit_in_cells
 from fieldfuse.pipelines.job import Job
 from fieldfuse.pipelines.prepare import Prepared
 from fieldfuse.pipelines.rendered import Pictures, to_picture, write_png
@@ -218,7 +219,8 @@ def fit_radiance_field(job: Job, ready: Prepared, network: NetworkField | None, 
         if network is not None and not settings.fit.finetune:
             return Fitted(direct_result(job, ready, network), [])
         first = None if network is None else network_start(network.field, views, scene, settings)
-        return Fitted.of(fit(views, settings=settings, begin=Begin(host, first, coarse=first is not None)))
+        begin = Begin(host, first, coarse=first is not None)
+        return Fitted.of(fit(views, settings=settings, begin=begin) if settings.fit.cells == "off" else fit_in_cells(job, views, scene, begin))
 
     def save(value: Fitted) -> list[Path]:
         value.field.save(path, scene.working_from_input, {"budget": settings.fit.budget, "seed": settings.seed})

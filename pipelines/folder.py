@@ -24,7 +24,7 @@ LOCK = ".lock"
 RUN = "run.json"
 STAGES = "stages"
 ERROR_LOG = "error.log"
-SUBFOLDERS = (STAGES, "frames", "unpacked", "sparse", "renders", "tsdf", "stereo", "tsdf_stereo", "compare", "tradeoff", "exports")
+SUBFOLDERS = (STAGES, "frames", "unpacked", "sparse", "renders", "tsdf", "stereo", "tsdf_stereo", "cells", "compare", "tradeoff", "exports")
 FILES = (
     *("capture.json", "plan.json", "poses.json", "effects.json", "scene.json", "keyframes.json", "views.safetensors"),
     *("network.safetensors", "network.json", "direct.safetensors", "preview.png", "field.safetensors", "timeline.json"),

@@ -32,6 +32,8 @@ _TOTAL = "Seconds for the whole run: picture size, voxels, a video's frames, fit
 _START = "Start of the fit: network, classical, or auto (default): the networks' with fewer than 24 training pictures."
 _FINETUNE = "Whether the networks' field is fitted (default), or the result."
 _SCALE = "Measured distance of two marked points: 'IMG_1:812,330 IMG_2:1204,341 = 1.20' (metres)."
+_CELLS = "Fit a large scene as so many cells, side by side where there are cores or nodes; auto: by its size."
+_ADDRESS = "Ray cluster that fits the cells: auto or HOST:PORT; default: this machine."
 _MARKER = "ArUco markers in the images and their side in metres: DICT_4X4_50:0.05."
 Source = Annotated[Path, typer.Argument(help=_SOURCE, show_default=False)]
 Target = Annotated[Path, typer.Argument(help=_TARGET, show_default=False)]
@@ -53,6 +55,8 @@ PosesFrom = Annotated[str | None, option("auto (default), given, or sfm: ignore 
 DepthScale = Annotated[str | None, option("Stored depth values to a metre, as 5000, or what one stands for, as 0.25mm.")]
 Scale = Annotated[str | None, option(_SCALE)]
 Marker = Annotated[str | None, option(_MARKER)]
+CellCount = Annotated[str | None, option(_CELLS, "--cells")]
+Address = Annotated[str | None, option(_ADDRESS)]
 Baked = Annotated[bool, option("Take the baked field, as pages have it; it is made if need be.", "--baked")]
 Config = Annotated[Path | None, option("YAML file with settings.")]
 Pairs = Annotated[list[str] | None, option("Any setting as key=value; may be repeated.", "--set", metavar="KEY=VALUE")]
@@ -94,6 +98,8 @@ class Options:
     depth_scale: DepthScale = None
     scale: Scale = None
     marker: Marker = None
+    cells: CellCount = None
+    address: Address = None
     config: Config = None
     pairs: Pairs = None
     quiet: Quiet = False
@@ -107,7 +113,7 @@ class Options:
 
 FLAGS = (
     *("budget", "image_size", "holdout", "device", "threads", "seed", "engine", "decoder", "init", "finetune", "poses"),
-    *("depth_scale", "scale", "marker"),
+    *("depth_scale", "scale", "marker", "cells", "address"),
 )
 
 

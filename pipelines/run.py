@@ -10,8 +10,8 @@ MOST_SECONDS = 1e7  # a third of a year
 
 
 @takes(
-    "preset budget total_budget image_size holdout device threads seed engine decoder init finetune poses depth_scale scale marker config "
-    "pairs quiet json"
+    "preset budget total_budget image_size holdout device threads seed engine decoder init finetune poses depth_scale scale marker cells "
+    "address config pairs quiet json"
 )
 def run(source: Source, out: Out, options: Options) -> None:
     """Turn a capture into a radiance field (and a TSDF surface, if it has depth), exports and a report.

@@ -333,6 +333,18 @@ class FieldSettings:
         return self.hidden or WIDTHS[self.decoder]
 
 
+MOST_CELLS = 10_000
+
+
+def _check_cells(value: Any) -> Any:
+    value = "off" if value is False else int(value) if isinstance(value, str) and value.isdigit() else value
+    whole = isinstance(value, int) and not isinstance(value, bool) and 1 <= value <= MOST_CELLS
+    if not whole and value not in ("off", "auto"):
+        sentence = f"it must be off, auto, or a number of cells from 1 to {MOST_CELLS:,}"
+        raise PydanticCustomError("choice", "{sentence}", {"sentence": sentence})
+    return value
+
+
 @dataclass
 class FitSettings:
     finetune: bool = True  # False: the networks' field is the result, nothing is fitted
@@ -360,6 +372,9 @@ class FitSettings:
     # of the finest lattice is one): what voxels cannot show is not asked of them. With few views, and 0: colours as they are
     soften: Share = 0.25
     prune_weight: Share = 0.05  # voxels whose largest seen weight stays below are removed
+    # A large scene as cells that are fitted one by one, or side by side on a cluster (docs/cluster.md): off, a number, or auto (by the size
+    # of the coarse field). The budget counts as if this machine's cores did all of it
+    cells: Annotated[int | str, BeforeValidator(_check_cells)] = "off"
 
 
 @dataclass
@@ -437,6 +452,7 @@ class Settings:
     device: Annotated[str, one_of("auto", "cpu", "cuda")] = "auto"
     threads: Positive | None = None  # None: all cores
     seed: Annotated[int, Field(ge=0, lt=2**31)] = 0
+    address: str | None = None  # of a Ray cluster for cells: auto or HOST:PORT; None: this machine
     capture: CaptureSettings = default(default_factory=CaptureSettings)
     poses: PosesSettings = default(default_factory=PosesSettings)
     views: ViewsSettings = default(default_factory=ViewsSettings)
@@ -463,6 +479,7 @@ SHORT_NAMES = {
     "background": "field.background",
     "init": "field.init",
     "finetune": "fit.finetune",
+    "cells": "fit.cells",
 }
 
 

@@ -1,0 +1,139 @@
+"""`fieldfuse run --cells`: the fit of a large scene, cell by cell, on this machine or on the nodes of a Ray cluster.
+
+The coarse field is fitted here. Then the folder `cells/` has all that a worker needs, and each cell that is fitted is a file there, so a
+run that is killed, or whose worker or node is lost, goes on with the cells that are missing.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import asdict, replace
+from pathlib import Path
+
+import numpy as np
+
+from fieldfuse.capture.types import Views
+from fieldfuse.cluster import News, Task, open_workers
+from fieldfuse.config import Settings
+from fieldfuse.errors import FieldfuseError, InputError, Interrupted
+from fieldfuse.files import fingerprint, remove
+from fieldfuse.nerfusion.decoder import Deferred
+from fieldfuse.pipelines.job import Job
+from fieldfuse.poses.scene import Scene
+from fieldfuse.render.field import Field
+from fieldfuse.training.cells import scene as cells
+from fieldfuse.training.fit import TIMELINE_PIXELS, Begin, FitResult, Sample
+from fieldfuse.training.guided import fit_guided
+
+FOLDER = "cells"
+
+
+def require_cells(settings: Settings) -> None:
+    """Refuse what cells cannot do.
+
+    Raises:
+        InputError: another device, engine or decoder than that of a fit on the CPU.
+    """
+    if settings.device != "cpu" or settings.engine not in ("auto", "numba"):
+        raise InputError("cells are fitted by the compiled engine of the CPU; add --device cpu, or leave --cells and --engine out")
+    if settings.field.decoder != "deferred":
+        raise InputError("cells are fitted with the deferred decoder; leave --decoder at deferred, or --cells out")
+    if not settings.fit.finetune:
+        raise InputError("cells are for a fit, and there is none with --no-finetune; leave one of the two out")
+
+
+def fit_in_cells(job: Job, views: Views, scene: Scene, begin: Begin) -> FitResult:
+    """Fit a coarse field, cut it, have the cells fitted, and put them together.
+
+    Args:
+        views: all of them, as `fit_guided` takes them.
+        begin: what the coarse fit begins with.
+
+    Raises:
+        InputError: the settings do not fit, the cluster cannot be used.
+        FieldfuseError: a cell could not be fitted; the others are kept.
+        Interrupted: the user asked to stop; what was fitted is kept.
+    """
+    settings, folder = job.settings, job.folder / FOLDER
+    require_cells(settings)
+    folder.mkdir(exist_ok=True)
+    inputs = {name: job.stages.records[name].made for name in job.stages.done("scene", "views", "stereo", "network")}
+    key = fingerprint(inputs, asdict(settings.field), asdict(settings.fit), settings.seed, settings.preset)
+    plan = cells.read_plan(folder)
+    if plan is None or plan.key != key:
+        for file in folder.iterdir():
+            remove(file)
+        plan = _cut(job, folder, key, views, scene, begin)
+    notes = [f"fitted as {plan.count} cells of a lattice of {plan.resolution}³ voxels around a coarse field"]
+    _fit_missing(job, folder, plan)
+    field, remarks = cells.merge_scene(folder, plan)
+    known = [cells.fitted_cell(folder, plan, cell) or {} for cell in range(plan.count)]
+    seconds = plan.seconds_before + sum(facts["seconds"] for facts in known)
+    result = FitResult(field, seconds=seconds, steps=sum(facts["steps"] for facts in known), notes=notes + remarks)
+    result.rays = plan.rays_before + sum(facts["rays"] for facts in known)
+    shown = Sample(views, np.flatnonzero(views.test), TIMELINE_PIXELS, field.device).psnr(_Shown(field))
+    result.timeline = [{"seconds": round(seconds, 3), "psnr": round(shown, 4)}] if shown is not None else []
+    return result
+
+
+class _Shown:
+    """A finished field as a sample of pixels looks at it."""
+
+    def __init__(self, field: Field) -> None:
+        from fieldfuse.render.image import make_renderer
+
+        self._view = make_renderer(field)
+
+    def colours(self, origins, directions):  # type: ignore[no-untyped-def]
+        return self._view(origins, directions).colour
+
+
+def _cut(job: Job, folder: Path, key: str, views: Views, scene: Scene, begin: Begin) -> cells.ScenePlan:
+    settings = job.settings
+    coarse = cells.coarse_settings(settings, cells.coarse_resolution(views, scene, settings))
+    result = fit_guided(views, scene, coarse, job.progress, begin)
+    if result.interrupted:
+        raise Interrupted("stopped on request before the coarse field was done; run the same command again")
+    if result.field.resolution != coarse.field.resolution or not isinstance(result.field.decoder, Deferred):
+        raise InputError(
+            f"the coarse field came to {result.field.resolution}³ voxels and cells need {coarse.field.resolution}³; give more --budget, or "
+            "leave --cells out"
+        )
+    count = settings.fit.cells if isinstance(settings.fit.cells, int) else None
+    return cells.write_scene(folder, key, result, views, scene, settings, count, job.progress)
+
+
+def _fit_missing(job: Job, folder: Path, plan: cells.ScenePlan) -> None:
+    """Have all cells fitted that are not."""
+    missing = [cell for cell in range(plan.count) if cells.fitted_cell(folder, plan, cell) is None]
+    if not missing:
+        return
+    shares = dict.fromkeys(missing, 0.0)
+    tasks = [Task(f"cell {cell + 1}", (str(folder), cell)) for cell in missing]
+    failed: list[str] = []
+    with open_workers(job.settings.address, cpus=job.settings.threads) as workers:
+        workers.check(folder)
+        at_once = workers.at_once(tasks[0])
+
+        def listen(news: News) -> None:
+            if job.progress.stopping():
+                workers.stop()
+            if isinstance(news.data, dict) and "done" in news.data:
+                shares[int(news.task.split()[1]) - 1] = news.data["done"] / max(news.data["total"], 1e-9)
+                show()
+
+        def show() -> None:
+            done = plan.count - len(missing) + sum(shares.values())
+            job.progress.update(done, plan.count, f"{plan.count} cells, {at_once} at once")
+
+        for task, outcome in workers.run(cells.fit_cell_of, tasks, listen):
+            shares[task.argument[1]] = 1.0 if outcome.error is None else 0.0
+            if outcome.error is not None and outcome.kind != "Interrupted":
+                failed.append(f"{task.name} of {plan.count} (on {outcome.node or 'a node that was lost'}): {outcome.error}")
+            if job.progress.stopping():
+                workers.stop()
+            show()
+    if failed:
+        raise FieldfuseError(f"{failed[0]}; {plan.count - len(failed)} cells are kept, run the same command again to fit the rest")
+    job.progress.check()

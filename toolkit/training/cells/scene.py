@@ -1,0 +1,249 @@
+"""A scene as cells on disk: what a worker needs to fit one of them, and nothing else.
+
+A folder holds
+
+    coarse.safetensors      the coarse field
+    cells.safetensors       blocks of the coarse field, their owners, and the rays that see them
+    pixels-003.safetensors  the training pixels of a cell
+    plan.json               the rest, written last
+    cell-003.safetensors    a fitted cell, with its halo
+
+so workers share storage and no memory, and whatever is there need not be made again.
+"""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable
+from dataclasses import asdict, dataclass, replace
+from functools import lru_cache
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from safetensors import SafetensorError, safe_open
+from safetensors.torch import save_file
+
+from fieldfuse.backends.constants import BLOCK
+from fieldfuse.capture.types import Views
+from fieldfuse.config import checked
+from fieldfuse.config import Settings, load_settings, settings_dict
+from fieldfuse.errors import InputError, Interrupted
+from fieldfuse.files import atomic_path, read_json, write_json
+from fieldfuse.poses.scene import Scene
+from fieldfuse.progress import SILENT, Progress
+from fieldfuse.render.bake import seen_weights
+from fieldfuse.render.field import Field
+from fieldfuse.training.cells.fit import CellPlan, FittedCell, fit_cell
+from fieldfuse.training.cells.merge import check_coverage, merged
+from fieldfuse.training.cells.partition import Cells, cut
+from fieldfuse.training.cells.pixels import Sight, pools
+from fieldfuse.training.engine import warm_up
+from fieldfuse.training.fit import DEFAULT_BUDGET, FitResult
+from fieldfuse.training.levels import pruned
+from fieldfuse.training.losses import FINE, ROUGH
+from fieldfuse.training.pixels import PixelPool
+from fieldfuse.training.start import finest_resolution, space_of
+from fieldfuse.volume.edit import dilate
+
+COARSER = 4  # times, than the finest lattice, is the coarse field's
+COARSE_SHARE = 0.35  # of the seconds or steps of the whole fit
+LEAST_RESOLUTION = 64  # of a coarse field
+VOXELS_A_CELL = 400_000  # that cells have on the finest lattice, where their number is left to us
+COARSE, CELLS, PLAN = "coarse.safetensors", "cells.safetensors", "plan.json"
+
+
+@dataclass(frozen=True)
+class ScenePlan:
+    """What all cells have in common (plain data).
+
+    Attributes:
+        key: identity of all that went in.
+        settings: of the run, plain.
+        count: cells.
+        resolution: of the finest lattice.
+        rays_before, seconds_before: that the coarse field took.
+        shares: of the scene's pixels, by cell; a pixel may be seen in several.
+        seconds, steps: of each cell, None: without end.
+        slow_within: working units.
+        rough: whether depth was matched quickly, and is trusted less.
+        opaque: whether every ray ends somewhere.
+    """
+
+    key: str
+    settings: dict[str, Any]
+    count: int
+    resolution: int
+    rays_before: int
+    seconds_before: float
+    shares: list[float]
+    seconds: list[float]
+    steps: list[int] | None
+    slow_within: float
+    rough: bool
+    opaque: bool
+
+
+def coarse_resolution(views: Views, scene: Scene, settings: Settings) -> int:
+    """Of the lattice that a scene is cut on."""
+    train = views.subset(np.flatnonzero(~views.test))
+    finest = settings.field.resolution or finest_resolution(space_of(views, scene, settings.field.background), train, scene)
+    return max(LEAST_RESOLUTION, finest // (COARSER * BLOCK * 2) * BLOCK * 2)
+
+
+def coarse_settings(settings: Settings, resolution: int) -> Settings:
+    """The settings of the coarse field's fit."""
+    fit, seconds = settings.fit, COARSE_SHARE * (settings.fit.budget or DEFAULT_BUDGET)
+    steps = None if fit.iterations is None else max(1, round(COARSE_SHARE * fit.iterations))
+    return replace(settings, field=replace(settings.field, resolution=resolution), fit=replace(fit, budget=seconds, iterations=steps))
+
+
+def cells_wanted(coarse: Field) -> int:
+    """How many cells a scene is worth: by the voxels that the finest lattice will have, so 1 where that is a field like any other.
+
+    Surfaces have four times as many voxels on a lattice twice as fine.
+    """
+    return max(1, round(coarse.voxels * COARSER**2 / VOXELS_A_CELL))
+
+
+def write_scene(
+    folder: Path, key: str, result: FitResult, views: Views, scene: Scene, settings: Settings, count: int | None, progress: Progress = SILENT
+) -> ScenePlan:
+    """Cut a scene by its coarse field.
+
+    Args:
+        result: of the coarse fit. count: cells; None: `cells_wanted`.
+
+    Raises:
+        InputError: training rays see nothing of the field.
+        OutputError: the folder cannot be written.
+        Interrupted: the user asked to stop.
+    """
+    shown = views if result.left_out is None else result.left_out.without(views)
+    train = shown.subset(np.flatnonzero(~shown.test))
+    coarse = result.field
+    seen = seen_weights(coarse, train.intrinsics, train.world_from_camera, progress) > settings.fit.prune_weight
+    coarse = pruned(coarse, dilate(coarse.topology, seen, 1, grow=False)[1]).settled()
+    sight = Sight(coarse, settings.threads)
+    rays = sight.rays_of_blocks(train)
+    if not rays.any():
+        raise InputError("training rays see nothing of the coarse field, so it cannot be cut into cells; give it more --budget")
+    voxels = coarse.occupied.view(-1, BLOCK**3).sum(1).numpy()
+    # Seconds go by rays, memory by voxels: cells are to be alike in both.
+    cells = cut(coarse.topology.keys.numpy(), np.sqrt(rays * voxels.astype(np.float64)), count or cells_wanted(coarse))
+    coarse.save(folder / COARSE, scene.working_from_input)
+    _write_tensors(folder / CELLS, {"keys": cells.keys, "owner": cells.owner, "rays": rays})
+    whole, sizes = sum(lens.width * lens.height for lens in train.intrinsics), []
+    for cell, pool in enumerate(pools(train, cells, sight, settings.fit.depth > 0)):
+        progress.check()
+        progress.update(cell, cells.count, "pixels of cells")
+        sizes.append(len(pool))
+        with atomic_path(folder / f"pixels-{cell:03}.safetensors") as temporary:
+            save_file({name: one.contiguous() for name, one in pool.arrays().items()}, temporary, {"height": str(pool.height)})
+    parts = [(1 - COARSE_SHARE) * size / sum(sizes) for size in sizes]
+    # What a fit in one piece would have on this machine: cells have one thread each, however many are fitted side by side.
+    budget, steps = (settings.fit.budget or DEFAULT_BUDGET) * (settings.threads or torch.get_num_threads()), settings.fit.iterations
+    plan = ScenePlan(
+        key=key,
+        settings=settings_dict(settings),
+        count=cells.count,
+        resolution=COARSER * coarse.resolution,
+        rays_before=result.rays,
+        seconds_before=result.seconds,
+        shares=[size / whole for size in sizes],
+        seconds=[part * budget for part in parts],
+        steps=None if steps is None else [max(1, round(part * steps)) for part in parts],
+        slow_within=settings.fit.slow_within * scene.median_depth,
+        rough=shown.rough,
+        opaque=shown.background is None,
+    )
+    write_json(folder / PLAN, asdict(plan))
+    return plan
+
+
+def _write_tensors(path: Path, arrays: dict[str, np.ndarray[Any, Any]]) -> None:
+    with atomic_path(path) as temporary:
+        save_file({name: torch.from_numpy(np.ascontiguousarray(values)) for name, values in arrays.items()}, temporary)
+
+
+def read_plan(folder: Path) -> ScenePlan | None:
+    """The plan of a folder; None: there is none, or it cannot be used."""
+    try:
+        return checked(ScenePlan, read_json(folder / PLAN), PLAN)
+    except InputError:
+        return None
+
+
+@lru_cache(maxsize=1)
+def _coarse_of(folder: Path, key: str) -> tuple[Field, Cells, np.ndarray[Any, Any]]:
+    """The coarse field and its cells; a worker that fits several cells of a scene reads them once."""
+    with _reading(folder / CELLS) as file:
+        keys, owner, rays = (file.get_tensor(name).numpy() for name in ("keys", "owner", "rays"))
+    return Field.load(folder / COARSE), Cells(keys, owner, int(owner.max()) + 1), rays
+
+
+def _reading(path: Path) -> Any:
+    try:
+        return safe_open(path, framework="pt")
+    except (OSError, SafetensorError) as error:
+        raise InputError(f"{path} cannot be read ({error}); remove its folder and start the run again") from error
+
+
+def cell_path(folder: Path, cell: int) -> Path:
+    return folder / f"cell-{cell:03}.safetensors"
+
+
+def fitted_cell(folder: Path, plan: ScenePlan, cell: int) -> dict[str, Any] | None:
+    """What is known of a fitted cell: key, seconds, steps, rays; None: it is not fitted."""
+    try:
+        found = read_json(cell_path(folder, cell).with_suffix(".json"))
+    except InputError:
+        return None
+    there = isinstance(found, dict) and found.get("key") == plan.key and cell_path(folder, cell).is_file()
+    return found if there else None
+
+
+def fit_cell_of(argument: tuple[str, int], progress: Progress, ticks: Callable[[], float] = time.perf_counter) -> dict[str, Any]:
+    """Fit cell `argument[1]` of the scene in the folder `argument[0]`, and write it there: the task of a worker.
+
+    Raises:
+        InputError: the folder cannot be read. OutputError: it cannot be written.
+        Interrupted: it was stopped before the cell was done.
+    """
+    folder, cell = Path(argument[0]), argument[1]
+    plan = read_plan(folder)
+    if plan is None:
+        raise InputError(f"{folder / PLAN} is not there or damaged; start the run again")
+    if (known := fitted_cell(folder, plan, cell)) is not None:
+        return known
+    coarse, cells, _ = _coarse_of(folder, plan.key)
+    settings = load_settings(plan.settings["preset"], stored=plan.settings)
+    with _reading(folder / f"pixels-{cell:03}.safetensors") as file:
+        names = ("colour", "places", "starts", "distance", "camera", "pose")
+        pool = PixelPool.of([file.get_tensor(name) for name in names], int(file.metadata()["height"]))
+    warm_up(replace(settings, device="cpu"), progress)
+    steps = None if plan.steps is None else plan.steps[cell]
+    trust = ROUGH if plan.rough else FINE
+    of_cell = CellPlan(
+        plan.resolution, plan.rays_before, plan.shares[cell], plan.seconds[cell], steps, plan.slow_within, trust, plan.opaque, settings.seed + cell
+    )
+    done: FittedCell = fit_cell(coarse, cells, cell, pool, settings, of_cell, progress, ticks)
+    if done.interrupted:
+        raise Interrupted
+    done.field.save(cell_path(folder, cell))
+    facts = {"key": plan.key, "seconds": round(done.seconds, 3), "steps": done.steps, "rays": done.rays, "voxels": done.field.voxels}
+    write_json(cell_path(folder, cell).with_suffix(".json"), facts)
+    return facts
+
+
+def merge_scene(folder: Path, plan: ScenePlan) -> tuple[Field, list[str]]:
+    """One field of all cells, and what there is to say about it.
+
+    Raises:
+        NotCoveredError: a part of the scene is missing. InputError: a file cannot be read.
+    """
+    coarse, cells, rays = _coarse_of(folder, plan.key)
+    paths = [cell_path(folder, cell) for cell in range(plan.count) if fitted_cell(folder, plan, cell) is not None]
+    field = merged(coarse, cells, [Field.load(path) for path in paths])
+    return field, check_coverage(coarse, rays, cells, field)
