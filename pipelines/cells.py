@@ -6,12 +6,11 @@ run that is killed, or whose worker or node is lost, goes on with the cells that
 
 from __future__ import annotations
 
-from collections.abc import Iterator
-from contextlib import contextmanager
-from dataclasses import asdict, replace
+from dataclasses import asdict
 from pathlib import Path
 
 import numpy as np
+import torch
 
 from fieldfuse.capture.types import Views
 from fieldfuse.cluster import News, Task, open_workers
@@ -22,6 +21,7 @@ from fieldfuse.nerfusion.decoder import Deferred
 from fieldfuse.pipelines.job import Job
 from fieldfuse.poses.scene import Scene
 from fieldfuse.render.field import Field
+from fieldfuse.render.image import make_renderer
 from fieldfuse.training.cells import scene as cells
 from fieldfuse.training.fit import TIMELINE_PIXELS, Begin, FitResult, Sample
 from fieldfuse.training.guided import fit_guided
@@ -81,11 +81,9 @@ class _Shown:
     """A finished field as a sample of pixels looks at it."""
 
     def __init__(self, field: Field) -> None:
-        from fieldfuse.render.image import make_renderer
-
         self._view = make_renderer(field)
 
-    def colours(self, origins, directions):  # type: ignore[no-untyped-def]
+    def colours(self, origins: torch.Tensor, directions: torch.Tensor) -> torch.Tensor:
         return self._view(origins, directions).colour
 
 
@@ -100,8 +98,7 @@ def _cut(job: Job, folder: Path, key: str, views: Views, scene: Scene, begin: Be
             f"the coarse field came to {result.field.resolution}³ voxels and cells need {coarse.field.resolution}³; give more --budget, or "
             "leave --cells out"
         )
-    count = settings.fit.cells if isinstance(settings.fit.cells, int) else None
-    return cells.write_scene(folder, key, result, views, scene, settings, count, job.progress)
+    return cells.write_scene(folder, key, result, views, scene, settings, job.progress)
 
 
 def _fit_missing(job: Job, folder: Path, plan: cells.ScenePlan) -> None:

@@ -220,7 +220,9 @@ def fit_radiance_field(job: Job, ready: Prepared, network: NetworkField | None, 
             return Fitted(direct_result(job, ready, network), [])
         first = None if network is None else network_start(network.field, views, scene, settings)
         begin = Begin(host, first, coarse=first is not None)
-        return Fitted.of(fit(views, settings=settings, begin=begin) if settings.fit.cells == "off" else fit_in_cells(job, views, scene, begin))
+        if settings.fit.cells != "off":
+            return Fitted.of(fit_in_cells(job, views, scene, begin))
+        return Fitted.of(fit(views, settings=settings, begin=begin))
 
     def save(value: Fitted) -> list[Path]:
         value.field.save(path, scene.working_from_input, {"budget": settings.fit.budget, "seed": settings.seed})

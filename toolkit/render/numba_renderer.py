@@ -45,17 +45,17 @@ def make_volume(field: Field) -> K.Volume:
     """The field's arrays; densities and features are the field's own memory, so what a fit changes is seen here at once."""
     filled = field.grid.bricks.numpy() > 0
     if field.outer is None:
-        none = np.empty((0, 1), np.float32)
-        rows = np.empty((0, 8), np.uint64), np.empty((0, 8), np.int32), none[:, 0], none
-        outer = K.Outer(np.empty((0, 0, 0), np.int32), *rows, 0, 0, 0, np.float32(0))
+        table, bits, upper = np.empty((0, 0, 0), np.int32), np.empty((0, 8), np.uint64), np.empty((0, 8), np.int32)
+        outer = K.Outer(table, bits, upper, np.empty(0, np.float32), np.empty((0, 1), np.float32), 0, 0, 0, np.float32(0))
     else:
-        around, origin = field.outer, (int(c) for c in field.outer.topology.table_origin)
-        outer = K.Outer(*_arrays(around), *origin, np.float32(around.resolution / field.resolution))
+        around = field.outer
+        x, y, z = (int(c) for c in around.topology.table_origin)
+        outer = K.Outer(*_arrays(around), x, y, z, np.float32(around.resolution / field.resolution))
         filled = filled | _on_finer_bricks(around.grid.bricks.numpy() > 0, len(filled))
     bricks = np.where(filled, np.uint8(0), np.uint8(FARTHEST))
     chessboard_distance(bricks, FARTHEST)
-    table, *rest = _arrays(field)
-    return K.Volume(table, bricks, *rest, outer)
+    table, bits, upper, density, feature = _arrays(field)
+    return K.Volume(table, bricks, bits, upper, density, feature, outer)
 
 
 def _arrays(field: Field) -> tuple[Array, Array, Array, Array, Array]:

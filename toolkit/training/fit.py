@@ -10,6 +10,7 @@ import time
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from dataclasses import field as default
+from typing import Protocol
 
 import numpy as np
 import torch
@@ -101,6 +102,12 @@ class Begin:
     rungs: tuple[float, ...] | None = None
 
 
+class Shows(Protocol):
+    """What gives colours for rays: an engine, or a finished field."""
+
+    def colours(self, origins: torch.Tensor, directions: torch.Tensor) -> torch.Tensor: ...
+
+
 class Sample:
     """PSNR over a fixed random sample of some views' pixels: the mean over views, in the colours of their photos, as the report's table
     counts it."""
@@ -114,12 +121,12 @@ class Sample:
             pick = torch.randperm(len(pool), generator=torch.Generator().manual_seed(0))[:pixels].to(device)
             self.batch, self.factor = pool.take(pick), _factors(some, *(place.cpu().numpy() for place in pool.seen_at(pick)))
 
-    def psnr(self, engine: Engine) -> float | None:
+    def psnr(self, engine: Shows) -> float | None:
         """Decibels, the mean over views; None: there are none."""
         each = self.each(engine)
         return float(each.mean()) if len(each) else None
 
-    def each(self, engine: Engine) -> Array:
+    def each(self, engine: Shows) -> Array:
         """(V,) decibels of each view that has pixels in the sample."""
         if self.batch is None:
             return np.zeros(0)

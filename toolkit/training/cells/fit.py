@@ -75,7 +75,8 @@ def fit_cell(
     while ladder[-1] < plan.resolution:
         ladder.append(ladder[-1] * 2)
     host, begin = TorchHost(), ticks()
-    current = _surrounded(finer(coarse, region_mask(coarse, cells, cell, coarse.resolution, ladder[0]), ladder[0], host), coarse, cells, cell)
+    region = region_mask(coarse, cells, cell, coarse.resolution, ladder[0])
+    current = _surrounded(finer(coarse, region, ladder[0], host), coarse, cells, cell)
     engine = NumbaEngine(current, pool, plan.seed, plan.threads)
     budget = plan.seconds or 1e9
     fit = replace(settings.fit, iterations=plan.steps)

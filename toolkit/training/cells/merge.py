@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -12,6 +11,7 @@ import torch
 from fieldfuse.errors import FieldfuseError
 from fieldfuse.render.field import Field
 from fieldfuse.training.cells.partition import Cells
+from fieldfuse.training.levels import in_rows
 from fieldfuse.volume.edit import corner_nodes
 from fieldfuse.volume.host import plain_rows
 from fieldfuse.volume.topology import VOXELS, Topology
@@ -51,8 +51,7 @@ def merged(coarse: Field, cells: Cells, fields: Sequence[Field]) -> Field:
             if owned:
                 inside = slots[mine][:, None] * VOXELS + torch.arange(VOXELS)
                 occupied[inside] = field.occupied.view(-1, VOXELS)[mine]
-    values = {"topology": topology, "occupied": occupied, "density_rows": rows.density, "feature_rows": rows.feature}
-    return replace(coarse, resolution=resolution, **values).settled()
+    return in_rows(coarse, rows, occupied, resolution).settled()
 
 
 def check_coverage(coarse: Field, seen: Array, cells: Cells, result: Field) -> list[str]:

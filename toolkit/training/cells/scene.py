@@ -27,8 +27,7 @@ from safetensors.torch import save_file
 
 from fieldfuse.backends.constants import BLOCK
 from fieldfuse.capture.types import Views
-from fieldfuse.config import checked
-from fieldfuse.config import Settings, load_settings, settings_dict
+from fieldfuse.config import Settings, checked, load_settings, settings_dict
 from fieldfuse.errors import InputError, Interrupted
 from fieldfuse.files import atomic_path, read_json, write_json
 from fieldfuse.poses.scene import Scene
@@ -108,12 +107,12 @@ def cells_wanted(coarse: Field) -> int:
 
 
 def write_scene(
-    folder: Path, key: str, result: FitResult, views: Views, scene: Scene, settings: Settings, count: int | None, progress: Progress = SILENT
+    folder: Path, key: str, result: FitResult, views: Views, scene: Scene, settings: Settings, progress: Progress = SILENT
 ) -> ScenePlan:
-    """Cut a scene by its coarse field.
+    """Cut a scene by its coarse field into `fit.cells`; `auto`: `cells_wanted`.
 
     Args:
-        result: of the coarse fit. count: cells; None: `cells_wanted`.
+        result: of the coarse fit.
 
     Raises:
         InputError: training rays see nothing of the field.
@@ -130,8 +129,9 @@ def write_scene(
     if not rays.any():
         raise InputError("training rays see nothing of the coarse field, so it cannot be cut into cells; give it more --budget")
     voxels = coarse.occupied.view(-1, BLOCK**3).sum(1).numpy()
+    count = settings.fit.cells if isinstance(settings.fit.cells, int) else cells_wanted(coarse)
     # Seconds go by rays, memory by voxels: cells are to be alike in both.
-    cells = cut(coarse.topology.keys.numpy(), np.sqrt(rays * voxels.astype(np.float64)), count or cells_wanted(coarse))
+    cells = cut(coarse.topology.keys.numpy(), np.sqrt(rays * voxels.astype(np.float64)), count)
     coarse.save(folder / COARSE, scene.working_from_input)
     _write_tensors(folder / CELLS, {"keys": cells.keys, "owner": cells.owner, "rays": rays})
     whole, sizes = sum(lens.width * lens.height for lens in train.intrinsics), []
@@ -223,10 +223,16 @@ def fit_cell_of(argument: tuple[str, int], progress: Progress, ticks: Callable[[
         names = ("colour", "places", "starts", "distance", "camera", "pose")
         pool = PixelPool.of([file.get_tensor(name) for name in names], int(file.metadata()["height"]))
     warm_up(replace(settings, device="cpu"), progress)
-    steps = None if plan.steps is None else plan.steps[cell]
-    trust = ROUGH if plan.rough else FINE
     of_cell = CellPlan(
-        plan.resolution, plan.rays_before, plan.shares[cell], plan.seconds[cell], steps, plan.slow_within, trust, plan.opaque, settings.seed + cell
+        resolution=plan.resolution,
+        rays_before=plan.rays_before,
+        share=plan.shares[cell],
+        seconds=plan.seconds[cell],
+        steps=None if plan.steps is None else plan.steps[cell],
+        slow_within=plan.slow_within,
+        trust=ROUGH if plan.rough else FINE,
+        opaque=plan.opaque,
+        seed=settings.seed + cell,
     )
     done: FittedCell = fit_cell(coarse, cells, cell, pool, settings, of_cell, progress, ticks)
     if done.interrupted:
