@@ -13,7 +13,7 @@ import numpy as np
 import torch
 
 from fieldfuse.capture.types import Views
-from fieldfuse.cluster import News, Task, open_workers
+from fieldfuse.cluster import News, Task, Workers, open_workers
 from fieldfuse.config import Settings
 from fieldfuse.errors import FieldfuseError, InputError, Interrupted
 from fieldfuse.files import fingerprint, remove
@@ -61,12 +61,15 @@ def fit_in_cells(job: Job, views: Views, scene: Scene, begin: Begin) -> FitResul
     inputs = {name: job.stages.records[name].made for name in job.stages.done("scene", "views", "stereo", "network")}
     key = fingerprint(inputs, asdict(settings.field), asdict(settings.fit), settings.seed, settings.preset)
     plan = cells.read_plan(folder)
-    if plan is None or plan.key != key:
-        for file in folder.iterdir():
-            remove(file)
-        plan = _cut(job, folder, key, views, scene, begin)
+    if plan is None or plan.key != key or cells.missing(folder, plan):
+        with open_workers(settings.address, cpus=settings.threads) as workers:  # a cluster that cannot be used is known before the coarse fit
+            workers.check(folder)
+            if plan is None or plan.key != key:
+                for file in folder.iterdir():
+                    remove(file)
+                plan = _cut(job, folder, key, views, scene, begin)
+            _fit_missing(job, folder, plan, workers)
     notes = [f"fitted as {plan.count} cells of a lattice of {plan.resolution}³ voxels around a coarse field"]
-    _fit_missing(job, folder, plan)
     field, remarks = cells.merge_scene(folder, plan)
     known = [cells.fitted_cell(folder, plan, cell) or {} for cell in range(plan.count)]
     seconds = plan.seconds_before + sum(facts["seconds"] for facts in known)
@@ -101,36 +104,31 @@ def _cut(job: Job, folder: Path, key: str, views: Views, scene: Scene, begin: Be
     return cells.write_scene(folder, key, result, views, scene, settings, job.progress)
 
 
-def _fit_missing(job: Job, folder: Path, plan: cells.ScenePlan) -> None:
+def _fit_missing(job: Job, folder: Path, plan: cells.ScenePlan, workers: Workers) -> None:
     """Have all cells fitted that are not."""
-    missing = [cell for cell in range(plan.count) if cells.fitted_cell(folder, plan, cell) is None]
-    if not missing:
-        return
+    missing = cells.missing(folder, plan)
     shares = dict.fromkeys(missing, 0.0)
     tasks = [Task(f"cell {cell + 1}", (str(folder), cell)) for cell in missing]
     failed: list[str] = []
-    with open_workers(job.settings.address, cpus=job.settings.threads) as workers:
-        workers.check(folder)
-        at_once = workers.at_once(tasks[0])
+    at_once = workers.at_once(tasks[0])
 
-        def listen(news: News) -> None:
-            if job.progress.stopping():
-                workers.stop()
-            if isinstance(news.data, dict) and "done" in news.data:
-                shares[int(news.task.split()[1]) - 1] = news.data["done"] / max(news.data["total"], 1e-9)
-                show()
+    def show() -> None:
+        done = plan.count - len(missing) + sum(shares.values())
+        job.progress.update(done, plan.count, f"{plan.count} cells, {at_once} at once")
+        if job.progress.stopping():
+            workers.stop()
 
-        def show() -> None:
-            done = plan.count - len(missing) + sum(shares.values())
-            job.progress.update(done, plan.count, f"{plan.count} cells, {at_once} at once")
+    def listen(news: News) -> None:
+        if isinstance(news.data, dict) and "done" in news.data:
+            shares[int(news.task.split()[1]) - 1] = news.data["done"] / max(news.data["total"], 1e-9)
+        show()
 
-        for task, outcome in workers.run(cells.fit_cell_of, tasks, listen):
-            shares[task.argument[1]] = 1.0 if outcome.error is None else 0.0
-            if outcome.error is not None and outcome.kind != "Interrupted":
-                failed.append(f"{task.name} of {plan.count} (on {outcome.node or 'a node that was lost'}): {outcome.error}")
-            if job.progress.stopping():
-                workers.stop()
-            show()
+    for task, outcome in workers.run(cells.fit_cell_of, tasks, listen):
+        shares[task.argument[1]] = 1.0 if outcome.error is None else 0.0
+        if outcome.error is not None and outcome.kind != "Interrupted":
+            failed.append(f"{task.name} of {plan.count} (on {outcome.node or 'a node that was lost'}): {outcome.error}")
+        show()
+    job.progress.check()
     if failed:
         raise FieldfuseError(f"{failed[0]}; {plan.count - len(failed)} cells are kept, run the same command again to fit the rest")
-    job.progress.check()
+    cells.remove_pixels(folder)

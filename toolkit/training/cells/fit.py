@@ -84,7 +84,7 @@ def fit_cell(
     policy = NonfinitePolicy()
     rays = steps = 0
     while (done := schedule.position(now := ticks() - begin)) < 1 and not progress.stopping():
-        if schedule.wants_finer(done):
+        if not schedule.finest and done > schedule.deadline():  # however few steps that were: all cells come to the same lattice
             keep = visible(current, engine.seen, engine.visits, settings.fit.prune_weight)
             schedule.climb()
             keep &= region_mask(current, cells, cell, coarse.resolution, schedule.resolution)
@@ -108,7 +108,9 @@ def fit_cell(
         rays += schedule.rays
         if steps % 20 == 0:
             progress.update(done, 1, f"cell {cell + 1} of {cells.count}, {schedule.resolution}³")
-    field = replace(engine.sync(), outer=None).settled()
+    if not schedule.finest:  # stopped, or broken, before that
+        current = finer(current, torch.ones_like(current.occupied), plan.resolution, host)
+    field = replace(current, outer=None).settled()
     return FittedCell(field, ticks() - begin, steps, rays, progress.stopping())
 
 

@@ -29,7 +29,7 @@ from fieldfuse.backends.constants import BLOCK
 from fieldfuse.capture.types import Views
 from fieldfuse.config import Settings, checked, load_settings, settings_dict
 from fieldfuse.errors import InputError, Interrupted
-from fieldfuse.files import atomic_path, read_json, write_json
+from fieldfuse.files import atomic_path, read_json, remove, write_json
 from fieldfuse.poses.scene import Scene
 from fieldfuse.progress import SILENT, Progress
 from fieldfuse.render.bake import seen_weights
@@ -48,7 +48,7 @@ from fieldfuse.volume.edit import dilate
 
 COARSER = 4  # times, than the finest lattice, is the coarse field's
 COARSE_SHARE = 0.35  # of the seconds or steps of the whole fit
-LEAST_RESOLUTION = 64  # of a coarse field
+LEAST_RESOLUTION = 32  # of a coarse field
 VOXELS_A_CELL = 400_000  # that cells have on the finest lattice, where their number is left to us
 COARSE, CELLS, PLAN = "coarse.safetensors", "cells.safetensors", "plan.json"
 
@@ -202,6 +202,17 @@ def fitted_cell(folder: Path, plan: ScenePlan, cell: int) -> dict[str, Any] | No
         return None
     there = isinstance(found, dict) and found.get("key") == plan.key and cell_path(folder, cell).is_file()
     return found if there else None
+
+
+def missing(folder: Path, plan: ScenePlan) -> list[int]:
+    """The cells that are not fitted yet."""
+    return [cell for cell in range(plan.count) if fitted_cell(folder, plan, cell) is None]
+
+
+def remove_pixels(folder: Path) -> None:
+    """Once all cells are fitted nobody needs them; they are as large as the images."""
+    for path in folder.glob("pixels-*.safetensors"):
+        remove(path)
 
 
 def fit_cell_of(argument: tuple[str, int], progress: Progress, ticks: Callable[[], float] = time.perf_counter) -> dict[str, Any]:
