@@ -14,7 +14,6 @@ import torch
 
 from fieldfuse.capture.types import Views
 from fieldfuse.cluster import News, Task, Workers, open_workers
-from fieldfuse.config import Settings
 from fieldfuse.errors import FieldfuseError, InputError, Interrupted
 from fieldfuse.files import fingerprint, remove
 from fieldfuse.nerfusion.decoder import Deferred
@@ -29,20 +28,6 @@ from fieldfuse.training.guided import fit_guided
 FOLDER = "cells"
 
 
-def require_cells(settings: Settings) -> None:
-    """Refuse what cells cannot do.
-
-    Raises:
-        InputError: another device, engine or decoder than that of a fit on the CPU.
-    """
-    if settings.device != "cpu" or settings.engine not in ("auto", "numba"):
-        raise InputError("cells are fitted by the compiled engine of the CPU; add --device cpu, or leave --cells and --engine out")
-    if settings.field.decoder != "deferred":
-        raise InputError("cells are fitted with the deferred decoder; leave --decoder at deferred, or --cells out")
-    if not settings.fit.finetune:
-        raise InputError("cells are for a fit, and there is none with --no-finetune; leave one of the two out")
-
-
 def fit_in_cells(job: Job, views: Views, scene: Scene, begin: Begin) -> FitResult:
     """Fit a coarse field, cut it, have the cells fitted, and put them together.
 
@@ -51,12 +36,11 @@ def fit_in_cells(job: Job, views: Views, scene: Scene, begin: Begin) -> FitResul
         begin: what the coarse fit begins with.
 
     Raises:
-        InputError: the settings do not fit, the cluster cannot be used.
+        InputError: the cluster cannot be used, or the seconds are too few for the coarse field.
         FieldfuseError: a cell could not be fitted; the others are kept.
         Interrupted: the user asked to stop; what was fitted is kept.
     """
     settings, folder = job.settings, job.folder / FOLDER
-    require_cells(settings)
     folder.mkdir(exist_ok=True)
     inputs = {name: job.stages.records[name].made for name in job.stages.done("scene", "views", "stereo", "network")}
     key = fingerprint(inputs, asdict(settings.field), asdict(settings.fit), settings.seed, settings.preset)

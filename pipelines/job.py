@@ -91,7 +91,24 @@ def changed_results(new: Settings, old: Settings) -> frozenset[str]:
 def _prepared(settings: Settings) -> Settings:
     set_threads(settings.threads)
     settings.device = choose_device(settings.device, settings.engine)
+    _require_cells(settings)
     return settings
+
+
+def _require_cells(settings: Settings) -> None:
+    """Refuse what cells cannot do, if there are to be any.
+
+    Raises:
+        InputError: another device, engine or decoder than that of a fit on the CPU.
+    """
+    if settings.fit.cells == "off":
+        return
+    if settings.device != "cpu" or settings.engine not in ("auto", "numba"):
+        raise InputError("cells are fitted by the compiled engine of the CPU; add --device cpu, or leave --cells and --engine out")
+    if settings.field.decoder != "deferred":
+        raise InputError("cells are fitted with the deferred decoder; leave --decoder at deferred, or --cells out")
+    if not settings.fit.finetune:
+        raise InputError("cells are for a fit, and there is none with --no-finetune; leave one of the two out")
 
 
 def check_places(source: Path, out: Path) -> None:

@@ -176,7 +176,7 @@ def read_plan(folder: Path) -> ScenePlan | None:
 
 
 @lru_cache(maxsize=1)
-def _coarse_of(folder: Path, key: str) -> tuple[Field, Cells, np.ndarray[Any, Any]]:
+def coarse_of(folder: Path, key: str) -> tuple[Field, Cells, np.ndarray[Any, Any]]:
     """The coarse field and its cells; a worker that fits several cells of a scene reads them once."""
     with _reading(folder / CELLS) as file:
         keys, owner, rays = (file.get_tensor(name).numpy() for name in ("keys", "owner", "rays"))
@@ -228,7 +228,7 @@ def fit_cell_of(argument: tuple[str, int], progress: Progress, ticks: Callable[[
         raise InputError(f"{folder / PLAN} is not there or damaged; start the run again")
     if (known := fitted_cell(folder, plan, cell)) is not None:
         return known
-    coarse, cells, _ = _coarse_of(folder, plan.key)
+    coarse, cells, _ = coarse_of(folder, plan.key)
     settings = load_settings(plan.settings["preset"], stored=plan.settings)
     with _reading(folder / f"pixels-{cell:03}.safetensors") as file:
         names = ("colour", "places", "starts", "distance", "camera", "pose")
@@ -260,7 +260,7 @@ def merge_scene(folder: Path, plan: ScenePlan) -> tuple[Field, list[str]]:
     Raises:
         NotCoveredError: a part of the scene is missing. InputError: a file cannot be read.
     """
-    coarse, cells, rays = _coarse_of(folder, plan.key)
+    coarse, cells, rays = coarse_of(folder, plan.key)
     paths = [cell_path(folder, cell) for cell in range(plan.count) if fitted_cell(folder, plan, cell) is not None]
     field = merged(coarse, cells, [Field.load(path) for path in paths])
     return field, check_coverage(coarse, rays, cells, field)
