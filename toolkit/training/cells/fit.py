@@ -69,14 +69,22 @@ def fit_cell(
     plan: CellPlan,
     progress: Progress = SILENT,
     ticks: Callable[[], float] = time.perf_counter,
+    start: Field | None = None,
 ) -> FittedCell:
-    """Refine what cell `cell` owns, and a halo of one block around that, on the pixels of `pool`."""
-    ladder = [coarse.resolution * 2]
-    while ladder[-1] < plan.resolution:
-        ladder.append(ladder[-1] * 2)
+    """Refine what cell `cell` owns, and a halo around that, on the pixels of `pool`.
+
+    Args:
+        start: the region on the finest lattice, to go on from (the seams); None: the coarse field's.
+    """
     host, begin = TorchHost(), ticks()
-    region = region_mask(coarse, cells, cell, coarse.resolution, ladder[0])
-    current = _surrounded(finer(coarse, region, ladder[0], host), coarse, cells, cell)
+    if start is None:
+        ladder = [coarse.resolution * 2]
+        while ladder[-1] < plan.resolution:
+            ladder.append(ladder[-1] * 2)
+        start = finer(coarse, region_mask(coarse, cells, cell, coarse.resolution, ladder[0]), ladder[0], host)
+    else:
+        ladder = [start.resolution]
+    current = _surrounded(start, coarse, cells, cell)
     engine = NumbaEngine(current, pool, plan.seed, plan.threads)
     budget = plan.seconds or 1e9
     fit = replace(settings.fit, iterations=plan.steps)

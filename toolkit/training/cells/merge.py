@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
@@ -23,26 +23,21 @@ class NotCoveredError(FieldfuseError):
     """A part of the scene is missing from what the cells gave."""
 
 
-def merged(coarse: Field, cells: Cells, fields: Sequence[Field]) -> Field:
-    """One field of those of all cells, each with the halo that it was fitted with.
+def merged(coarse: Field, cells: Cells, fields: Mapping[int, Field]) -> Field:
+    """One field of those of some cells, by their numbers, each with the halo that it was fitted with.
 
     A corner of a voxel that lies on a border belongs to the block it lies in, and so to that block's owner; where the owner has no use for
     it (its own voxels there are empty), the neighbour's value stays.
-
-    Raises:
-        NotCoveredError: a cell is missing.
     """
-    if len(fields) != cells.count:
-        raise NotCoveredError(f"{len(fields)} of {cells.count} cells were fitted; start the run again, and it fits the others")
-    resolution = fields[0].resolution
+    resolution, channels = next((field.resolution, field.feature_rows.shape[1]) for field in fields.values())
     ratio = resolution // coarse.resolution
-    keys = torch.from_numpy(np.unique(np.concatenate([field.topology.keys.numpy() for field in fields]), axis=0))
+    keys = torch.from_numpy(np.unique(np.concatenate([field.topology.keys.numpy() for field in fields.values()]), axis=0))
     topology = Topology(keys)
-    rows = plain_rows(topology, fields[0].feature_rows.shape[1])
+    rows = plain_rows(topology, channels)
     occupied = torch.zeros(topology.zero_row, dtype=torch.bool)
     owner = cells.owner_of(keys.numpy(), ratio)
     for owned in (False, True):  # what a cell owns is written last
-        for index, field in enumerate(fields):
+        for index, field in fields.items():
             slots = topology.find(field.topology.keys)
             mine = torch.from_numpy(owner[slots.numpy()] == index)
             used = (corner_nodes(field.topology, field.occupied).view(-1, VOXELS) & (mine == owned)[:, None]).nonzero()

@@ -23,6 +23,7 @@ from fieldfuse.training.cells.partition import Cells
 from fieldfuse.training.pixels import PixelPool
 
 STRIDE = 4
+WIDER = 4  # such places about one at which a cell is seen that are its pixels, too: its halo is seen there
 LEAST = 0.02  # of a ray's light: what a cell holds less of, others explain
 
 
@@ -53,7 +54,7 @@ class Sight:
             pieces = [slice(start, start + 4096) for start in range(0, len(lines), 4096)]
             share(lambda piece: self._look(lines[piece], cells.owner, np.zeros(cells.count, np.int64), out[piece]), pieces, self.threads)  # noqa: B023
             seen = np.ascontiguousarray(out.reshape(high, wide, cells.count).transpose(2, 0, 1)).view(np.uint8)
-            yield np.array([cv2.dilate(one, np.ones((3, 3), np.uint8)) for one in seen]).astype(bool)
+            yield np.array([cv2.dilate(one, np.ones((2 * WIDER + 1,) * 2, np.uint8)) for one in seen]).astype(bool)
 
     def _look(self, lines: Array, owner: Array, counts: Array, out: Array) -> None:
         limits = np.float32(STOP), np.float32(THRESHOLD)

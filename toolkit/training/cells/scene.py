@@ -6,7 +6,7 @@ A folder holds
     cells.safetensors       blocks of the coarse field, their owners, and the rays that see them
     pixels-003.safetensors  the training pixels of a cell
     plan.json               the rest, written last
-    cell-003.safetensors    a fitted cell, with its halo
+    cell-003-1.safetensors  a fitted cell, with its halo, after the first of `ROUNDS`
 
 so workers share storage and no memory, and whatever is there need not be made again.
 """
@@ -35,7 +35,7 @@ from fieldfuse.progress import SILENT, Progress
 from fieldfuse.render.bake import seen_weights
 from fieldfuse.render.field import Field
 from fieldfuse.training.cells.fit import CellPlan, FittedCell, fit_cell
-from fieldfuse.training.cells.merge import check_coverage, merged
+from fieldfuse.training.cells.merge import NotCoveredError, check_coverage, merged
 from fieldfuse.training.cells.partition import Cells, cut
 from fieldfuse.training.cells.pixels import Sight, pools
 from fieldfuse.training.engine import warm_up
@@ -48,6 +48,8 @@ from fieldfuse.volume.edit import dilate
 
 COARSER = 4  # times, than the finest lattice, is the coarse field's
 COARSE_SHARE = 0.35  # of the seconds or steps of the whole fit
+# Of a cell's seconds or steps: around it first the coarse field, then, near borders, what its neighbours have come to.
+ROUNDS = (0.8, 0.2)
 LEAST_RESOLUTION = 32  # of a coarse field
 VOXELS_A_CELL = 400_000  # that cells have on the finest lattice, where their number is left to us
 COARSE, CELLS, PLAN = "coarse.safetensors", "cells.safetensors", "plan.json"
@@ -190,23 +192,23 @@ def _reading(path: Path) -> Any:
         raise InputError(f"{path} cannot be read ({error}); remove its folder and start the run again") from error
 
 
-def cell_path(folder: Path, cell: int) -> Path:
-    return folder / f"cell-{cell:03}.safetensors"
+def cell_path(folder: Path, cell: int, turn: int) -> Path:
+    return folder / f"cell-{cell:03}-{turn + 1}.safetensors"
 
 
-def fitted_cell(folder: Path, plan: ScenePlan, cell: int) -> dict[str, Any] | None:
-    """What is known of a fitted cell: key, seconds, steps, rays; None: it is not fitted."""
+def fitted_cell(folder: Path, plan: ScenePlan, cell: int, turn: int) -> dict[str, Any] | None:
+    """What is known of a fitted cell: key, seconds, steps, rays, voxels; None: it is not fitted."""
+    path = cell_path(folder, cell, turn)
     try:
-        found = read_json(cell_path(folder, cell).with_suffix(".json"))
+        found = read_json(path.with_suffix(".json"))
     except InputError:
         return None
-    there = isinstance(found, dict) and found.get("key") == plan.key and cell_path(folder, cell).is_file()
-    return found if there else None
+    return found if isinstance(found, dict) and found.get("key") == plan.key and path.is_file() else None
 
 
-def missing(folder: Path, plan: ScenePlan) -> list[int]:
+def missing(folder: Path, plan: ScenePlan, turn: int) -> list[int]:
     """The cells that are not fitted yet."""
-    return [cell for cell in range(plan.count) if fitted_cell(folder, plan, cell) is None]
+    return [cell for cell in range(plan.count) if fitted_cell(folder, plan, cell, turn) is None]
 
 
 def remove_pixels(folder: Path) -> None:
@@ -215,18 +217,21 @@ def remove_pixels(folder: Path) -> None:
         remove(path)
 
 
-def fit_cell_of(argument: tuple[str, int], progress: Progress, ticks: Callable[[], float] = time.perf_counter) -> dict[str, Any]:
-    """Fit cell `argument[1]` of the scene in the folder `argument[0]`, and write it there: the task of a worker.
+def fit_cell_of(argument: tuple[str, int, int], progress: Progress, ticks: Callable[[], float] = time.perf_counter) -> dict[str, Any]:
+    """Fit a cell, and write it into the scene's folder: the task of a worker.
+
+    Args:
+        argument: the folder, the cell, and which of `ROUNDS` it is.
 
     Raises:
         InputError: the folder cannot be read. OutputError: it cannot be written.
         Interrupted: it was stopped before the cell was done.
     """
-    folder, cell = Path(argument[0]), argument[1]
+    folder, cell, turn = Path(argument[0]), argument[1], argument[2]
     plan = read_plan(folder)
     if plan is None:
         raise InputError(f"{folder / PLAN} is not there or damaged; start the run again")
-    if (known := fitted_cell(folder, plan, cell)) is not None:
+    if (known := fitted_cell(folder, plan, cell, turn)) is not None:
         return known
     coarse, cells, _ = coarse_of(folder, plan.key)
     settings = load_settings(plan.settings["preset"], stored=plan.settings)
@@ -234,24 +239,36 @@ def fit_cell_of(argument: tuple[str, int], progress: Progress, ticks: Callable[[
         names = ("colour", "places", "starts", "distance", "camera", "pose")
         pool = PixelPool.of([file.get_tensor(name) for name in names], int(file.metadata()["height"]))
     warm_up(replace(settings, device="cpu"), progress)
+    start, before = (None, 0) if turn == 0 else _joined(folder, plan, cell)
     of_cell = CellPlan(
         resolution=plan.resolution,
-        rays_before=plan.rays_before,
+        rays_before=plan.rays_before + int(before / max(plan.shares[cell], 1e-6)),
         share=plan.shares[cell],
-        seconds=plan.seconds[cell],
-        steps=None if plan.steps is None else plan.steps[cell],
+        seconds=ROUNDS[turn] * plan.seconds[cell],
+        steps=None if plan.steps is None else max(1, round(ROUNDS[turn] * plan.steps[cell])),
         slow_within=plan.slow_within,
         trust=ROUGH if plan.rough else FINE,
         opaque=plan.opaque,
-        seed=settings.seed + cell,
+        seed=settings.seed + plan.count * turn + cell,
     )
-    done: FittedCell = fit_cell(coarse, cells, cell, pool, settings, of_cell, progress, ticks)
+    done: FittedCell = fit_cell(coarse, cells, cell, pool, settings, of_cell, progress, ticks, start)
     if done.interrupted:
         raise Interrupted
-    done.field.save(cell_path(folder, cell))
+    path = cell_path(folder, cell, turn)
+    done.field.save(path)
     facts = {"key": plan.key, "seconds": round(done.seconds, 3), "steps": done.steps, "rays": done.rays, "voxels": done.field.voxels}
-    write_json(cell_path(folder, cell).with_suffix(".json"), facts)
+    write_json(path.with_suffix(".json"), facts)
     return facts
+
+
+def _joined(folder: Path, plan: ScenePlan, cell: int) -> tuple[Field, int]:
+    """The region of a cell as the first round left it, the halo as its neighbours have it; and the rays of that round."""
+    coarse, cells, _ = coarse_of(folder, plan.key)
+    facts = fitted_cell(folder, plan, cell, 0) or {}
+    fields = {other: Field.load(cell_path(folder, other, 0)) for other in cells.neighbours(cell)}
+    whole = merged(coarse, cells, fields)
+    inside = cells.in_region(whole.topology.keys.numpy().astype(np.int64), whole.resolution // coarse.resolution, cell)
+    return pruned(whole, torch.from_numpy(inside).repeat_interleave(BLOCK**3)).settled(), int(facts["rays"])
 
 
 def merge_scene(folder: Path, plan: ScenePlan) -> tuple[Field, list[str]]:
@@ -261,6 +278,8 @@ def merge_scene(folder: Path, plan: ScenePlan) -> tuple[Field, list[str]]:
         NotCoveredError: a part of the scene is missing. InputError: a file cannot be read.
     """
     coarse, cells, rays = coarse_of(folder, plan.key)
-    paths = [cell_path(folder, cell) for cell in range(plan.count) if fitted_cell(folder, plan, cell) is not None]
-    field = merged(coarse, cells, [Field.load(path) for path in paths])
+    last = len(ROUNDS) - 1
+    if absent := missing(folder, plan, last):
+        raise NotCoveredError(f"{len(absent)} of {plan.count} cells are not fitted; start the run again, and it fits them")
+    field = merged(coarse, cells, {cell: Field.load(cell_path(folder, cell, last)) for cell in range(plan.count)})
     return field, check_coverage(coarse, rays, cells, field)
