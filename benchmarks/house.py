@@ -34,17 +34,17 @@ from fieldfuse.simulate.simulate import CaptureWriter
 CELL = 0.2  # metres, of the grid on which ways are planned
 EYES = (1.2, 1.5)  # metres above the floor: the first and the second pass
 BODY = (0.5, 0.85, *EYES)  # metres above the floor, where a person needs clearance
-CLEARANCE = 0.35  # metres to walls and furniture: doors of 0.9 m are passed on a grid of 0.2 m
-FLAT = 0.15  # metres by which the floor may rise: more is furniture
+CLEARANCE = 0.35  # metres to walls and furniture
+FLAT = 0.15  # metres by which the floor may rise or fall
 NARROW = 1.0  # metres cost up to twice as much near walls and furniture, so that ways keep off them
 REACH = 2.0  # metres, those: from every free place to the next stop of the walk
 STEP = 0.05  # metres between samples of the path
 ROUNDING, ROUNDS = 0.3, 4  # metres over which corners are rounded, and how often
 AHEAD = 1.0  # metres: the camera looks at where it will be then
 ASIDE = 0.3  # metres that it looks farther away from walls, so that it turns round towards the room
-SWAY, WAVE = 30.0, 6.0  # degrees to the left and right, metres of a period
+SWAY, WAVE = 30.0, 6.0  # degrees to the left and right; metres of a period
 DOWN = (8.0, 14.0)  # degrees below the horizon, of the two passes
-TURN = 60.0  # degrees a metre: where the view turns faster, the walk slows down
+TURN = 60.0  # degrees a metre at full speed: where the view turns faster, the walk slows down
 SPEED = 0.5  # metres a second
 LONGEST = 0.25  # metres between frames at most, with two passes; else there is one
 FOV = 72.0  # degrees
@@ -54,7 +54,7 @@ WORKERS = 2
 
 @dataclass(frozen=True)
 class FreeSpace:
-    """Where a person can walk: the largest connected part of a building's floor."""
+    """Where a person can walk: the largest connected part of a building's floor, as a grid."""
 
     scene: Scenery
     floor: float  # metres, z
@@ -89,7 +89,7 @@ def free_space(scene: Scenery) -> FreeSpace:
     start = min(scene.mesh().vertices[:, 2].min() + EYES[0], high[2])
     origins = torch.from_numpy(np.column_stack([places, np.full(len(places), start)])).float()
     below = start - scene.see(Rays(origins, torch.tensor([0.0, 0.0, -1.0]).repeat(len(origins), 1), 0.0)).distance.numpy()
-    hit = below > start - EYES[0] - 1
+    hit = below > start - EYES[0] - 1  # outside the building there is nothing below
     floor = float(np.median(below[hit])) if hit.any() else 0.0
     room = _clearance(scene, floor, places)
     free = hit & (np.abs(below - floor) < FLAT) & (room >= CLEARANCE)
@@ -111,7 +111,7 @@ def free_space(scene: Scenery) -> FreeSpace:
 
 
 def stops(free: FreeSpace) -> Array:
-    """(K,) cells from which every free cell is within `REACH`: each time the one with most cells that no other reaches yet."""
+    """(K,) cells from which every free cell is within `REACH`: a greedy set cover."""
     parts = np.array_split(np.arange(len(free.places)), 1 + len(free.places) // 512)
     near = np.concatenate([dijkstra(free.graph, directed=False, indices=part, limit=REACH) <= REACH for part in parts])
     missing, chosen = np.ones(len(near), bool), list[int]()
@@ -122,7 +122,7 @@ def stops(free: FreeSpace) -> Array:
 
 
 def shortest_round(lengths: Array) -> list[int]:
-    """A short round trip over all of (K, K) distances: to the nearest next, then parts are reversed as long as that shortens it (2-opt)."""
+    """The order of a short round trip over (K, K) distances: always to the nearest, then improved by reversing parts of it (2-opt)."""
     order, left = [0], set(range(1, len(lengths)))
     while left:
         order.append(min(left, key=lambda stop: lengths[order[-1], stop]))
@@ -165,8 +165,10 @@ def _resampled(path: Array) -> Array:
 
 
 def walk(free: FreeSpace, path: Array, passes: int, rng: np.random.Generator) -> Curve:
-    """The camera's way along a closed path (S, 2): once, or also back at another height. Measured in metres, or in turns where those
-    take longer."""
+    """The camera's way along a closed path (S, 2): once, or also back at another height.
+
+    Its length is in metres; where the view turns fast, each `TURN` degrees count as one.
+    """
     there = np.concatenate([path, path[::-1]][:passes])
     number = np.repeat(np.arange(passes), len(path))
     along = np.arange(len(there)) * STEP
