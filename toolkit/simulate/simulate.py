@@ -126,14 +126,15 @@ class CaptureWriter:
     Args:
         output: "frames", "photos" or "video".
         suffix: ".jpg" when images are compressed, else ".png".
+        per_pixel: whether the ground truth has depth and normals of each frame, 10 bytes a pixel.
     """
 
-    def __init__(self, folder: Path, intrinsics: Intrinsics, fps: float, output: str, suffix: str) -> None:
-        self.folder, self.intrinsics, self.output, self.suffix = folder, intrinsics, output, suffix
+    def __init__(self, folder: Path, intrinsics: Intrinsics, fps: float, output: str, suffix: str, per_pixel: bool = True) -> None:
+        self.folder, self.intrinsics, self.output, self.suffix, self.per_pixel = folder, intrinsics, output, suffix, per_pixel
         self.entries, self.poses, self.facts = (list[dict[str, Any]]() for _ in range(3))
         self.receiver: Receiver | None = None  # where images get their GPS from
         self._video: cv2.VideoWriter | None = None
-        for name in (f"{TRUTH}/frames", *(() if output == "video" else ("images",))):
+        for name in (f"{TRUTH}/frames" if per_pixel else TRUTH, *(() if output == "video" else ("images",))):
             (folder / name).mkdir(parents=True, exist_ok=True)
         if output == "video":
             size = (intrinsics.width, intrinsics.height)
@@ -160,12 +161,14 @@ class CaptureWriter:
             (self.folder / entry["depth_file_path"]).write_bytes(encoded(stored))
         entry["transform_matrix"] = opengl_from_world(shot.world_from_camera).tolist()
         self.entries.append(entry)
-        exact = {"depth": np.ascontiguousarray(shot.depth), "normals": shot.normals.astype(np.float16)}
-        if shot.passed is not None:
-            exact["passers"] = shot.passed.astype(np.uint8)
-        (self.folder / truth).write_bytes(save(exact))
+        if self.per_pixel:
+            exact = {"depth": np.ascontiguousarray(shot.depth), "normals": shot.normals.astype(np.float16)}
+            if shot.passed is not None:
+                exact["passers"] = shot.passed.astype(np.uint8)
+            (self.folder / truth).write_bytes(save(exact))
         picture = {"video_index": shot.index} if self.output == "video" else {"picture": entry["file_path"]}
-        self.poses.append({**picture, "truth": truth, "seconds": shot.seconds, "world_from_camera": shot.world_from_camera.tolist()})
+        exactly = {"truth": truth} if self.per_pixel else {}
+        self.poses.append({**picture, **exactly, "seconds": shot.seconds, "world_from_camera": shot.world_from_camera.tolist()})
         self.facts.append({**picture, **shot.facts})
 
     def finish(self, about: dict[str, Any], effects: dict[str, Any], mesh: Mesh) -> None:
