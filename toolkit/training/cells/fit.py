@@ -20,6 +20,8 @@ from fieldfuse.training.pixels import PixelPool
 from fieldfuse.training.schedule import Schedule
 from fieldfuse.volume.host import TorchHost
 
+LEAST_BATCH = 512  # rays a step; else so many that a voxel gets as many of them as in a fit of the whole scene
+
 
 @dataclass(frozen=True)
 class CellPlan:
@@ -91,6 +93,7 @@ def fit_cell(
     schedule = Schedule(ladder, budget, fit, plan.opaque, slow_within=plan.slow_within, trust=plan.trust)
     policy = NonfinitePolicy()
     rays = steps = 0
+    batch = max(LEAST_BATCH, round(settings.fit.max_rays * plan.share))
     while (done := schedule.position(now := ticks() - begin)) < 1 and not progress.stopping():
         if not schedule.finest and done > schedule.deadline():  # however few steps that were: all cells come to the same lattice
             keep = visible(current, engine.seen, engine.visits, settings.fit.prune_weight)
@@ -105,7 +108,7 @@ def fit_cell(
         whole = plan.rays_before + int(rays / max(plan.share, 1e-6))
         rates = replace(policy.scaled_rates(schedule.rates(done, whole)), decoder=0.0)
         try:
-            engine.step(schedule.rays, rates)
+            engine.step(batch, rates)
         except NotFiniteError as error:
             if policy.handle(error, steps, schedule.resolution, now):
                 continue
@@ -113,7 +116,7 @@ def fit_cell(
         schedule.steps += 1
         schedule.steps_here += 1
         steps += 1
-        rays += schedule.rays
+        rays += batch
         if steps % 20 == 0:
             progress.update(done, 1, f"cell {cell + 1} of {cells.count}, {schedule.resolution}³")
     if not schedule.finest:  # stopped, or broken, before that
