@@ -129,7 +129,8 @@ def surface_of_field(
         InputError: the field has no surface, or there is too little memory.
         Interrupted: the user asked to stop.
     """
-    from fieldfuse.render.image import make_renderer, render_view
+    from fieldfuse.render.coarse_to_fine import render_coarse_to_fine
+    from fieldfuse.render.image import make_renderer
     from fieldfuse.stereo.depth_refinement import FieldDepths, Polisher, settled
 
     shown, cameras = originals.finer(views, np.flatnonzero(~views.test), settings.export)
@@ -146,7 +147,7 @@ def surface_of_field(
     )
 
     def render(lens: Intrinsics, pose: Array) -> Rendered:
-        return render_view(field, at_most(lens, RENDERED_SIDE), pose, view)
+        return render_coarse_to_fine(field, at_most(lens, RENDERED_SIDE).pinhole(), pose, view)
 
     region = Region.box(*scene.surface_box())
     region = region if crop is None else region.both(crop)
