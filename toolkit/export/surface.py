@@ -129,7 +129,8 @@ def surface_of_field(
         InputError: the field has no surface, or there is too little memory.
         Interrupted: the user asked to stop.
     """
-    from fieldfuse.render.image import make_renderer, render_view
+    from fieldfuse.render.coarse_to_fine import render_coarse_to_fine
+    from fieldfuse.render.image import make_renderer
     from fieldfuse.stereo.depth_refinement import FieldDepths, Polisher, settled
 
     shown, cameras = originals.finer(views, np.flatnonzero(~views.test), settings.export)
@@ -146,7 +147,7 @@ def surface_of_field(
     )
 
     def render(lens: Intrinsics, pose: Array) -> Rendered:
-        return render_view(field, at_most(lens, RENDERED_SIDE), pose, view)
+        return render_coarse_to_fine(field, at_most(lens, RENDERED_SIDE).pinhole(), pose, view)
 
     region = Region.box(*scene.surface_box())
     region = region if crop is None else region.both(crop)
@@ -245,14 +246,14 @@ def _rendered_frame(
 
 def _within(frame: DepthFrame, region: Region) -> DepthFrame:
     """The frame without depth of points outside the region."""
-    depth, camera, pose = frame.depth.copy(), frame.depth_intrinsics, frame.world_from_camera
-    v, u = np.nonzero(depth)
-    z = depth[v, u].astype(np.float64)
-    points = np.stack([(u + 0.5 - camera.cx) / camera.fx * z, (v + 0.5 - camera.cy) / camera.fy * z, z], axis=1)
-    points = points @ pose[:3, :3].T + pose[:3, 3]
-    outside = ~region.inside(points)
-    depth[v[outside], u[outside]] = 0
-    return replace(frame, depth=depth)
+    depth, camera, pose = frame.depth, frame.depth_intrinsics, frame.world_from_camera
+    u = ((np.arange(camera.width) + 0.5 - camera.cx) / camera.fx).astype(np.float32)
+    v = ((np.arange(camera.height) + 0.5 - camera.cy) / camera.fy).astype(np.float32)[:, None]
+    inside = depth > 0
+    # In the camera's frame a side of the region bounds the depth times what grows evenly along rows and columns: no points are made.
+    for (x, y, z), offset in zip(region.normals @ pose[:3, :3], region.offsets - region.normals @ pose[:3, 3], strict=True):
+        inside &= depth * (np.float32(x) * u + (np.float32(y) * v + np.float32(z))) <= offset
+    return replace(frame, depth=np.where(inside, depth, np.float32(0)))
 
 
 def whole_mesh(volume: TsdfVolume, smooth: int) -> Mesh:

@@ -9,6 +9,7 @@ from typing import Any, NamedTuple
 import numpy as np
 import torch
 
+from fieldfuse.backends.constants import SOLID
 from fieldfuse.backends.numba import common as K
 from fieldfuse.backends.numba.march import mark_pass
 from fieldfuse.backends.numba.volume import chessboard_distance
@@ -33,7 +34,7 @@ OUTLIERS = 1e-3  # share of the corners on either side whose values are clipped,
 MOST_CORNERS = 200_000  # that the range of values is taken from
 SEEN = 0.01  # largest weight below which a voxel is excluded …
 FIRM = 0.3  # … but for those beside one with as much: where thin surfaces have holes, renders from between the views see through them
-MOST_RAYS = 3_000_000  # of all views together; of more pixels a regular part is looked at
+MOST_RAYS = 2_000_000  # of all views together; of more pixels an even part is looked at
 
 
 class Baked(NamedTuple):
@@ -261,14 +262,15 @@ def seen_voxels(
     Raises:
         Interrupted: the user asked to stop.
     """
-    weight = seen_weights(field, intrinsics, world_from_camera, progress)
+    weight = seen_weights(field, intrinsics, world_from_camera, progress, least)
     return (weight > least) | (dilate(field.topology, weight > max(FIRM, least), 1, grow=False)[1] & field.occupied)
 
 
 def seen_weights(
-    field: Field, intrinsics: Sequence[Intrinsics], world_from_camera: Array, progress: Progress = SILENT
+    field: Field, intrinsics: Sequence[Intrinsics], world_from_camera: Array, progress: Progress = SILENT, least: float = 0.0
 ) -> torch.Tensor:
     """(M · 512,) largest share of a pixel's light that a voxel holds, over pinhole views (N, 4, 4); 1 for the strongest of a ray that ends.
+    Shares that are less than `least` may be missing: rays end where no more is left.
 
     Raises:
         Interrupted: the user asked to stop.
@@ -277,7 +279,7 @@ def seen_weights(
     cameras = np.array([(c.fx, c.fy, c.cx, c.cy, c.width, c.height) for c in intrinsics], np.float32).reshape(-1, 6)
     poses = np.ascontiguousarray(world_from_camera[:, :3], np.float32)
     stride = -(-sum(c.width * c.height for c in intrinsics) // MOST_RAYS) or 1
-    marks = np.zeros((threads, len(field.occupied)), np.uint16)
+    marks, stop = np.zeros((threads, len(field.occupied)), np.uint16), np.float32(min(max(least, STOP), SOLID))
 
     def part(thread: int) -> None:
         for view in range(thread, len(cameras), threads):
@@ -285,7 +287,7 @@ def seen_weights(
                 return
             if thread == 0:
                 progress.update(view, len(cameras), "looking where training views look")
-            mark_pass(space, volume, cameras, poses, view, view + 1, stride, np.float32(STOP), marks[thread])
+            mark_pass(space, volume, cameras, poses, view, view + 1, stride, stop, marks[thread])
 
     share(part, range(threads), threads)
     progress.check()

@@ -8,12 +8,12 @@ from dataclasses import dataclass
 import cv2
 import numpy as np
 
-from fieldfuse.backends.numba.depth_maps import compare
+from fieldfuse.backends.numba.depth_maps import compare, compare_colours
 from fieldfuse.camera import Array, Intrinsics, invert
 
 TOLERANCE = 0.02  # share of depth by which two views may differ
 SPECKLE = 1 / 2000  # share of the image: smaller patches of kept depth are dropped
-NO_IMAGE, NO_COLOURS = np.empty((0, 0, 3), np.uint8), np.empty((0, 0), np.float32)
+NO_SUMS = np.empty((0, 0))
 
 
 @dataclass(frozen=True)
@@ -31,7 +31,7 @@ class Agreement:
 
     agree: Array  # (H, W) int32 how many have the same point …
     through: Array  # … and how many see through it
-    total: Array  # (H, W) float64 sum of the inverse depths of the pixel itself and of those that agree
+    total: Array  # (H, W) float64 sum of the inverse depths of the pixel itself and of those that agree; or of height 0
     colours: Array  # (others or 0, H, W) float32 how much the colours there differ, in levels; NaN: hidden, or out of sight
 
 
@@ -49,7 +49,7 @@ def confirmed(index: int, others: Sequence[int], maps: DepthMaps, needed: int = 
         (H, W) float32 depth, 0 where it is not kept, and (H, W) float32 confidence in [0, 1): a / (a + t + 1) for a others that agree and t
         that see through the point.
     """
-    found = agreement(index, others, maps, noise)
+    found = agreement(index, others, maps, noise, sums=True)
     kept = (maps.depths[index] > 0) & (found.agree >= needed) & (found.agree > found.through)
     mean = np.where(kept, (found.agree + 1) / np.maximum(found.total, 1e-12), 0)
     kept &= ~_speckles(mean)
@@ -58,26 +58,36 @@ def confirmed(index: int, others: Sequence[int], maps: DepthMaps, needed: int = 
 
 
 def agreement(
-    index: int, others: Sequence[int], maps: DepthMaps, noise: float = 0.0, images: Sequence[Array] | None = None
+    index: int, others: Sequence[int], maps: DepthMaps, noise: float = 0.0, images: Sequence[Array] | None = None, sums: bool = False
 ) -> Agreement:
     """How the views `others` compare with each pixel of the depth map `index`.
 
     Args:
         noise: as in `confirmed`.
         images: (H, W, 3) uint8 of all views, of the size of their depth maps; None: colours are not compared.
+        sums: `Agreement.total` is wanted.
     """
-    seen = [
-        (np.ascontiguousarray(maps.depths[view], np.float32), numbers(maps.cameras[view]), images[view] if images else NO_IMAGE)
-        for view in (index, *others)
-    ]
-    depth = seen[0][0]
+    depth = np.ascontiguousarray(maps.depths[index], np.float32)
     agree, through = np.zeros(depth.shape, np.int32), np.zeros(depth.shape, np.int32)
-    total = np.where(depth > 0, 1 / np.maximum(depth, 1e-12), 0)
+    total = np.where(depth > 0, 1 / np.maximum(depth, 1e-12), 0) if sums else NO_SUMS
     colours = np.full((len(others) if images else 0, *depth.shape), np.nan, np.float32)
+    here = _ray_matrix(maps.cameras[index])
     for number, other in enumerate(others):
-        there = invert(maps.world_from_camera[other]) @ maps.world_from_camera[index]
-        compare(seen[0], seen[1 + number], there, TOLERANCE, noise, agree, through, total, colours[number] if images else NO_COLOURS)
+        theirs = np.ascontiguousarray(maps.depths[other], np.float32)
+        there, away = invert(maps.world_from_camera[other]) @ maps.world_from_camera[index], _ray_matrix(maps.cameras[other])
+        onto = np.column_stack([maps.cameras[other].matrix() @ there[:3, :3] @ here, maps.cameras[other].matrix() @ there[:3, 3]])
+        home = invert(there)
+        back = np.append(home[2, :3] @ away, home[2, 3]).astype(np.float32)
+        onto = np.ascontiguousarray(onto, np.float32)
+        compare(depth, theirs, onto, back, TOLERANCE, noise, agree, through, total)
+        if images:
+            compare_colours(depth, theirs, onto, images[index], images[other], colours[number])
     return Agreement(agree, through, total, colours)
+
+
+def _ray_matrix(camera: Intrinsics) -> Array:
+    """(3, 3) from u, v, 1 to the ray of depth 1 through that place of the image."""
+    return np.asarray(np.linalg.inv(camera.matrix()))
 
 
 def numbers(camera: Intrinsics) -> Array:

@@ -9,6 +9,8 @@ from numba import njit
 
 HIDDEN = 0.03  # share of a point's depth by which another view's surface before it hides its colour
 OPTIONS: dict[str, Any] = {"cache": True, "nogil": True}
+FAST: dict[str, Any] = {**OPTIONS, "error_model": "numpy"}  # a division that may be by zero does not become vectors otherwise
+F = np.float32
 
 
 @njit(**OPTIONS)
@@ -21,54 +23,79 @@ def _moved(move: Any, x: float, y: float, z: float) -> Any:
     )
 
 
-@njit(**OPTIONS)
-def compare(
-    here: Any, away: Any, there: Any, tolerance: float, noise: float, agree: Any, through: Any, total: Any, colours: Any
-) -> None:
+@njit(**FAST)
+def _seen_at(depth: Any, y: int, onto: Any, columns: int, rows: int, place: Any, away: Any) -> None:
+    """Where another view of this size sees the points of the row `y`: its pixel `place`, row by row, and the depth `away` there, 0: not
+    at all. A loop of its own, because it becomes vectors, and what is read at these places not."""
+    zero, one, half = F(0), F(1), F(0.5)
+    ax, ay, az, mx, my, mz = onto[0, 0], onto[1, 0], onto[2, 0], onto[0, 3], onto[1, 3], onto[2, 3]
+    v = F(y) + half
+    bx, by, bz = onto[0, 1] * v + onto[0, 2], onto[1, 1] * v + onto[1, 2], onto[2, 1] * v + onto[2, 2]
+    across, right, bottom = np.int32(columns), F(columns), F(rows)
+    for x in range(len(depth)):
+        z, u = depth[x], F(np.int32(x)) + half
+        qz = (az * u + bz) * z + mz
+        scale = one / max(qz, F(1e-12))
+        column, row = ((ax * u + bx) * z + mx) * scale, ((ay * u + by) * z + my) * scale
+        inside = (z > zero) & (qz > zero) & (column >= zero) & (column < right) & (row >= zero) & (row < bottom)
+        away[x] = qz if inside else zero
+        place[x] = np.int32(row) * across + np.int32(column) if inside else np.int32(0)
+
+
+@njit(**FAST)
+def compare(depth: Any, other: Any, onto: Any, back: Any, tolerance: float, noise: float, agree: Any, through: Any, total: Any) -> None:
     """Count for each pixel whether one other view confirms its depth or sees through it, and sum up the inverse depths that confirm it.
 
     Args:
-        here, away: depth (H, W), camera (4,) and image of the view and of the other. Images, (H, W, 3) uint8 or of height 0, are compared
-            where nothing stands before the point, whether the other's depth is known or not.
-        there: (4, 4) from the view's frame to the other's.
+        depth, other: (H, W) and (h, w) float32 depth of the view and of the other.
+        onto: (3, 4) float32 from u, v, 1 (both from the corner of the image) times depth, and 1, to the other's pixel times its depth.
+        back: (4,) float32 the depth in the view of what the other sees: from u, v, 1 times depth there, and 1.
+        total: (H, W) float64; or of height 0, if sums are not wanted.
     """
-    depth, camera, image = here
-    other, other_camera, other_image = away
     height, width = depth.shape
     rows, columns = other.shape
-    fx, fy, cx, cy = camera
-    gx, gy, ox, oy = other_camera
+    one, half, same, rough = F(1), F(0.5), F(tolerance), F(noise)
+    place, away = np.empty(width, np.int32), np.empty(width, np.float32)
+    maps = other.reshape(-1)
     for y in range(height):
+        _seen_at(depth[y], y, onto, columns, rows, place, away)
         for x in range(width):
-            z = depth[y, x]
-            if z <= 0:
+            qz = away[x]
+            if qz <= F(0):
                 continue
-            qx, qy, qz = _moved(there, (x + 0.5 - cx) / fx * z, (y + 0.5 - cy) / fy * z, z)
-            if qz <= 0:
+            seen = maps[np.uintp(place[x])]
+            if seen <= F(0):
                 continue
-            u, v = qx / qz * gx + ox, qy / qz * gy + oy
-            if not (0 <= u < columns and 0 <= v < rows):
-                continue
-            column, row = int(u), int(v)
-            seen = other[row, column]
-            if len(image) > 0 and not 0 < seen < (1 - HIDDEN) * qz:
-                difference = 0.0
-                for channel in range(3):
-                    difference += abs(float(image[y, x, channel]) - float(other_image[row, column, channel]))
-                colours[y, x] = difference / 3
-            if seen <= 0:
-                continue
-            if abs(seen - qz) <= max(tolerance, noise * seen) * qz:
-                # The other's point, brought back: rotation transposed.
-                rx = (column + 0.5 - ox) / gx * seen - there[0, 3]
-                ry = (row + 0.5 - oy) / gy * seen - there[1, 3]
-                rz = seen - there[2, 3]
-                back = there[0, 2] * rx + there[1, 2] * ry + there[2, 2] * rz
-                if back > 0:
+            if abs(seen - qz) <= max(same, rough * seen) * qz:
+                row = place[x] // columns
+                u, v = F(place[x] - row * columns) + half, F(row) + half
+                there = (back[0] * u + back[1] * v + back[2]) * seen + back[3]
+                if there > F(0):
                     agree[y, x] += 1
-                    total[y, x] += 1 / back
+                    if len(total) > 0:
+                        total[y, x] += one / there
             elif seen > qz:
                 through[y, x] += 1
+
+
+@njit(**FAST)
+def compare_colours(depth: Any, other: Any, onto: Any, image: Any, other_image: Any, out: Any) -> None:
+    """(H, W) mean difference of the colours of what nothing stands before in another view, whether the depth there is known or not; other
+    pixels stay. `image`, `other_image`: (…, 3) uint8 of the sizes of the depth maps; others as in `compare`."""
+    height, width = depth.shape
+    rows, columns = other.shape
+    place, away = np.empty(width, np.int32), np.empty(width, np.float32)
+    for y in range(height):
+        _seen_at(depth[y], y, onto, columns, rows, place, away)
+        for x in range(width):
+            row = place[x] // columns
+            column = place[x] - row * columns
+            if away[x] <= F(0) or F(0) < other[row, column] < F(1 - HIDDEN) * away[x]:
+                continue
+            difference = F(0)
+            for channel in range(3):
+                difference += abs(F(image[y, x, channel]) - F(other_image[row, column, channel]))
+            out[y, x] = difference / F(3)
 
 
 @njit(**OPTIONS)
