@@ -103,8 +103,9 @@ def _fit_missing(job: Job, folder: Path, plan: cells.ScenePlan, turn: int, worke
 
     def show() -> None:
         part = (plan.count - len(missing) + sum(shares.values())) / plan.count
-        done = sum(cells.ROUNDS[:turn]) + cells.ROUNDS[turn] * part
-        job.progress.update(done, 1, f"{plan.count} cells{', borders' if turn else ''}, {at_once} at once")
+        begin = cells.ROUNDS[turn - 1] if turn else 0.0
+        done = begin + (cells.ROUNDS[turn] - begin) * part
+        job.progress.update(done, 1, f"{plan.count} cells, round {turn + 1} of {LAST + 1}, {at_once} at once")
         if job.progress.stopping():
             workers.stop()
 

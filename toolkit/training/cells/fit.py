@@ -20,6 +20,7 @@ from fieldfuse.training.pixels import PixelPool
 from fieldfuse.training.schedule import Schedule
 from fieldfuse.volume.host import TorchHost
 
+CLIMB = (0.5,)  # of a cell's seconds, at which it goes to the finest lattice: that of a fit in one piece has less than half, too
 LEAST_BATCH = 512  # rays a step; else so many that a voxel gets as many of them as in a fit of the whole scene
 
 
@@ -31,7 +32,8 @@ class CellPlan:
         resolution: of its finest lattice, the coarse field's times a power of two.
         rays_before: that the coarse field was fitted with.
         share: of the scene's pixels that are the cell's: with so much fewer rays it comes as far.
-        seconds, steps: the end of the fit, whichever comes first; None: the other.
+        seconds, steps: of the whole fit, whichever are spent first; None: the other.
+        begin, end: shares of these at which this part of it begins and ends: between parts, neighbours exchange what they have.
         slow_within: see `Schedule`.
         trust: see `Schedule`.
         opaque: every ray ends somewhere (captures without alpha).
@@ -48,6 +50,8 @@ class CellPlan:
     trust: Trust
     opaque: bool
     seed: int
+    begin: float = 0.0
+    end: float = 1.0
     threads: int = 1
 
 
@@ -76,7 +80,7 @@ def fit_cell(
     """Refine what cell `cell` owns, and a halo around that, on the pixels of `pool`.
 
     Args:
-        start: the region on the finest lattice, to go on from (the seams); None: the coarse field's.
+        start: the region on the finest lattice, to go on from; None: the coarse field's.
     """
     host, begin = TorchHost(), ticks()
     if start is None:
@@ -90,11 +94,13 @@ def fit_cell(
     engine = NumbaEngine(current, pool, plan.seed, plan.threads)
     budget = plan.seconds or 1e9
     fit = replace(settings.fit, iterations=plan.steps)
-    schedule = Schedule(ladder, budget, fit, plan.opaque, slow_within=plan.slow_within, trust=plan.trust)
+    schedule = Schedule(ladder, budget, fit, plan.opaque, slow_within=plan.slow_within, trust=plan.trust, rungs=CLIMB)
+    schedule.steps = 0 if plan.steps is None else round(plan.begin * plan.steps)
+    ago = 0.0 if plan.seconds is None else plan.begin * plan.seconds
     policy = NonfinitePolicy()
     rays = steps = 0
     batch = max(LEAST_BATCH, round(settings.fit.max_rays * plan.share))
-    while (done := schedule.position(now := ticks() - begin)) < 1 and not progress.stopping():
+    while (done := schedule.position(ago + (now := ticks() - begin))) < plan.end and not progress.stopping():
         if not schedule.finest and done > schedule.deadline():  # however few steps that were: all cells come to the same lattice
             keep = visible(current, engine.seen, engine.visits, settings.fit.prune_weight)
             schedule.climb()

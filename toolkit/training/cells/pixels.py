@@ -23,8 +23,8 @@ from fieldfuse.training.cells.partition import Cells
 from fieldfuse.training.pixels import PixelPool
 
 STRIDE = 4
-WIDER = 4  # such places about one at which a cell is seen that are its pixels, too: its halo is seen there
-LEAST = 0.02  # of a ray's light: what a cell holds less of, others explain
+WIDER = 1  # such places about one at which a cell is seen that are its pixels, too: its halo is seen there
+LEAST = 0.05  # of a ray's light: what a cell holds less of, others explain
 
 
 class Sight:

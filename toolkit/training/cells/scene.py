@@ -6,7 +6,7 @@ A folder holds
     cells.safetensors       blocks of the coarse field, their owners, and the rays that see them
     pixels-003.safetensors  the training pixels of a cell
     plan.json               the rest, written last
-    cell-003-1.safetensors  a fitted cell, with its halo, after the first of `ROUNDS`
+    cell-003-1.safetensors  a fitted cell, with its halo, after the first of the `ROUNDS`
 
 so workers share storage and no memory, and whatever is there need not be made again.
 """
@@ -48,8 +48,9 @@ from fieldfuse.volume.edit import dilate
 
 COARSER = 4  # times, than the finest lattice, is the coarse field's
 COARSE_SHARE = 0.35  # of the seconds or steps of the whole fit
-# Of a cell's seconds or steps: around it first the coarse field, then, near borders, what its neighbours have come to.
-ROUNDS = (0.8, 0.2)
+# Shares of a cell's seconds or steps at which the rounds of its fit end. In the first it has the coarse field around it, in the others its
+# halo is as its neighbours have come to: the sooner step sizes fall, the less two neighbours drift apart again.
+ROUNDS = (0.7, 0.85, 1.0)
 LEAST_RESOLUTION = 32  # of a coarse field
 VOXELS_A_CELL = 400_000  # that cells have on the finest lattice, where their number is left to us
 COARSE, CELLS, PLAN = "coarse.safetensors", "cells.safetensors", "plan.json"
@@ -239,13 +240,15 @@ def fit_cell_of(argument: tuple[str, int, int], progress: Progress, ticks: Calla
         names = ("colour", "places", "starts", "distance", "camera", "pose")
         pool = PixelPool.of([file.get_tensor(name) for name in names], int(file.metadata()["height"]))
     warm_up(replace(settings, device="cpu"), progress)
-    start, before = (None, 0) if turn == 0 else _joined(folder, plan, cell)
+    start, before = (None, 0) if turn == 0 else _joined(folder, plan, cell, turn - 1)
     of_cell = CellPlan(
         resolution=plan.resolution,
         rays_before=plan.rays_before + int(before / max(plan.shares[cell], 1e-6)),
         share=plan.shares[cell],
-        seconds=ROUNDS[turn] * plan.seconds[cell],
-        steps=None if plan.steps is None else max(1, round(ROUNDS[turn] * plan.steps[cell])),
+        seconds=plan.seconds[cell],
+        steps=None if plan.steps is None else plan.steps[cell],
+        begin=ROUNDS[turn - 1] if turn else 0.0,
+        end=ROUNDS[turn],
         slow_within=plan.slow_within,
         trust=ROUGH if plan.rough else FINE,
         opaque=plan.opaque,
@@ -261,14 +264,14 @@ def fit_cell_of(argument: tuple[str, int, int], progress: Progress, ticks: Calla
     return facts
 
 
-def _joined(folder: Path, plan: ScenePlan, cell: int) -> tuple[Field, int]:
-    """The region of a cell as the first round left it, the halo as its neighbours have it; and the rays of that round."""
+def _joined(folder: Path, plan: ScenePlan, cell: int, turn: int) -> tuple[Field, int]:
+    """The region of a cell as round `turn` left it, the halo as its neighbours have it; and the cell's rays so far."""
     coarse, cells, _ = coarse_of(folder, plan.key)
-    facts = fitted_cell(folder, plan, cell, 0) or {}
-    fields = {other: Field.load(cell_path(folder, other, 0)) for other in cells.neighbours(cell)}
+    rays = sum((fitted_cell(folder, plan, cell, one) or {"rays": 0})["rays"] for one in range(turn + 1))
+    fields = {other: Field.load(cell_path(folder, other, turn)) for other in cells.neighbours(cell)}
     whole = merged(coarse, cells, fields)
     inside = cells.in_region(whole.topology.keys.numpy().astype(np.int64), whole.resolution // coarse.resolution, cell)
-    return pruned(whole, torch.from_numpy(inside).repeat_interleave(BLOCK**3)).settled(), int(facts["rays"])
+    return pruned(whole, torch.from_numpy(inside).repeat_interleave(BLOCK**3)).settled(), rays
 
 
 def merge_scene(folder: Path, plan: ScenePlan) -> tuple[Field, list[str]]:
