@@ -103,11 +103,10 @@ class Bench:
             coarse = fit_guided(self.views, self.scene, settings, begin=Begin(host_for("cpu")), ticks=time.process_time)
             plan = cells.write_scene(folder, "benchmark", coarse, self.views, self.scene, self.settings)
         watches = []
-        for turn in range(len(cells.ROUNDS)):
-            for cell in range(plan.count):
-                with Watch() as watch:
-                    cells.fit_cell_of((str(folder), cell, turn), SILENT, time.process_time)
-                watches.append(watch)
+        for cell in range(plan.count):
+            with Watch() as watch:
+                cells.fit_cell_of((str(folder), cell), SILENT, time.process_time)
+            watches.append(watch)
         with Watch() as after:
             field, _ = cells.merge_scene(folder, plan)
         _, known, _ = cells.coarse_of(folder, plan.key)

@@ -26,7 +26,6 @@ from fieldfuse.training.fit import TIMELINE_PIXELS, Begin, FitResult, Sample
 from fieldfuse.training.guided import fit_guided
 
 FOLDER = "cells"
-LAST = len(cells.ROUNDS) - 1
 
 
 def fit_in_cells(job: Job, views: Views, scene: Scene, begin: Begin) -> FitResult:
@@ -46,19 +45,18 @@ def fit_in_cells(job: Job, views: Views, scene: Scene, begin: Begin) -> FitResul
     inputs = {name: job.stages.records[name].made for name in job.stages.done("scene", "views", "stereo", "network")}
     key = fingerprint(inputs, asdict(settings.field), asdict(settings.fit), settings.seed, settings.preset)
     plan = cells.read_plan(folder)
-    if plan is None or plan.key != key or cells.missing(folder, plan, LAST):
+    if plan is None or plan.key != key or cells.missing(folder, plan):
         with open_workers(settings.address, cpus=settings.threads) as workers:  # a cluster that cannot be used is known before the coarse fit
             workers.check(folder)
             if plan is None or plan.key != key:
                 for file in folder.iterdir():
                     remove(file)
                 plan = _cut(job, folder, key, views, scene, begin)
-            for turn in range(LAST + 1):
-                _fit_missing(job, folder, plan, turn, workers)
+            _fit_missing(job, folder, plan, workers)
             cells.remove_pixels(folder)
     notes = [f"fitted as {plan.count} cells of a lattice of {plan.resolution}³ voxels around a coarse field"]
     field, remarks = cells.merge_scene(folder, plan)
-    known = [cells.fitted_cell(folder, plan, cell, turn) or {} for cell in range(plan.count) for turn in range(LAST + 1)]
+    known = [cells.fitted_cell(folder, plan, cell) or {} for cell in range(plan.count)]
     seconds = plan.seconds_before + sum(facts["seconds"] for facts in known)
     result = FitResult(field, seconds=seconds, steps=sum(facts["steps"] for facts in known), notes=notes + remarks)
     result.rays = plan.rays_before + sum(facts["rays"] for facts in known)
@@ -91,21 +89,19 @@ def _cut(job: Job, folder: Path, key: str, views: Views, scene: Scene, begin: Be
     return cells.write_scene(folder, key, result, views, scene, settings, job.progress)
 
 
-def _fit_missing(job: Job, folder: Path, plan: cells.ScenePlan, turn: int, workers: Workers) -> None:
-    """Have all cells fitted that are not yet, in round `turn`."""
-    missing = cells.missing(folder, plan, turn)
+def _fit_missing(job: Job, folder: Path, plan: cells.ScenePlan, workers: Workers) -> None:
+    """Have all cells fitted that are not yet."""
+    missing = cells.missing(folder, plan)
     if not missing:
         return
     shares = dict.fromkeys(missing, 0.0)
-    tasks = [Task(f"cell {cell + 1}", (str(folder), cell, turn)) for cell in missing]
+    tasks = [Task(f"cell {cell + 1}", (str(folder), cell)) for cell in missing]
     failed: list[str] = []
     at_once = workers.at_once(tasks[0])
 
     def show() -> None:
-        part = (plan.count - len(missing) + sum(shares.values())) / plan.count
-        begin = cells.ROUNDS[turn - 1] if turn else 0.0
-        done = begin + (cells.ROUNDS[turn] - begin) * part
-        job.progress.update(done, 1, f"{plan.count} cells, round {turn + 1} of {LAST + 1}, {at_once} at once")
+        done = plan.count - len(missing) + sum(shares.values())
+        job.progress.update(done, plan.count, f"{plan.count} cells, {at_once} at once")
         if job.progress.stopping():
             workers.stop()
 

@@ -50,12 +50,6 @@ class Cells:
         place = np.clip(np.floor_divide(keys, ratio) + origin, 0, np.array(table.shape) - 1)
         return np.asarray(table[tuple(place.T)])
 
-    def neighbours(self, cell: int) -> list[int]:
-        """Cells with a block beside one of `cell`, and itself."""
-        own = self.keys[self.owner == cell].astype(np.int64)
-        found = {int(other) for shift in product((-1, 0, 1), repeat=3) for other in np.unique(self.owner_of(own + shift, 1))}
-        return sorted(found - {-1})
-
     def in_region(self, keys: Array, ratio: int, cell: int) -> Array:
         """(N, 3) blocks of a lattice finer by `ratio` → (N,) bool: owned by `cell`, or at most `HALO` blocks from one that is."""
         near = np.zeros(len(keys), bool)

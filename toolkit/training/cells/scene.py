@@ -6,7 +6,7 @@ A folder holds
     cells.safetensors       blocks of the coarse field, their owners, and the rays that see them
     pixels-003.safetensors  the training pixels of a cell
     plan.json               the rest, written last
-    cell-003-1.safetensors  a fitted cell, with its halo, after the first of the `ROUNDS`
+    cell-003.safetensors    a fitted cell, with its halo
 
 so workers share storage and no memory, and whatever is there need not be made again.
 """
@@ -34,7 +34,7 @@ from fieldfuse.poses.scene import Scene
 from fieldfuse.progress import SILENT, Progress
 from fieldfuse.render.bake import seen_weights
 from fieldfuse.render.field import Field
-from fieldfuse.training.cells.fit import CellPlan, FittedCell, fit_cell
+from fieldfuse.training.cells.fit import COARSER, CellPlan, FittedCell, fit_cell
 from fieldfuse.training.cells.merge import NotCoveredError, check_coverage, merged
 from fieldfuse.training.cells.partition import Cells, cut
 from fieldfuse.training.cells.pixels import Sight, pools
@@ -46,11 +46,7 @@ from fieldfuse.training.pixels import PixelPool
 from fieldfuse.training.start import finest_resolution, space_of
 from fieldfuse.volume.edit import dilate
 
-COARSER = 4  # times, than the finest lattice, is the coarse field's
-COARSE_SHARE = 0.35  # of the seconds or steps of the whole fit
-# Shares of a cell's seconds or steps at which the rounds of its fit end. In the first it has the coarse field around it, in the others its
-# halo is as its neighbours have come to: the sooner step sizes fall, the less two neighbours drift apart again.
-ROUNDS = (0.7, 0.85, 1.0)
+COARSE_SHARE = 0.55  # of the seconds or steps of the whole fit: one in one piece comes to its finest lattice as late
 LEAST_RESOLUTION = 32  # of a coarse field
 VOXELS_A_CELL = 400_000  # that cells have on the finest lattice, where their number is left to us
 COARSE, CELLS, PLAN = "coarse.safetensors", "cells.safetensors", "plan.json"
@@ -193,13 +189,13 @@ def _reading(path: Path) -> Any:
         raise InputError(f"{path} cannot be read ({error}); remove its folder and start the run again") from error
 
 
-def cell_path(folder: Path, cell: int, turn: int) -> Path:
-    return folder / f"cell-{cell:03}-{turn + 1}.safetensors"
+def cell_path(folder: Path, cell: int) -> Path:
+    return folder / f"cell-{cell:03}.safetensors"
 
 
-def fitted_cell(folder: Path, plan: ScenePlan, cell: int, turn: int) -> dict[str, Any] | None:
+def fitted_cell(folder: Path, plan: ScenePlan, cell: int) -> dict[str, Any] | None:
     """What is known of a fitted cell: key, seconds, steps, rays, voxels; None: it is not fitted."""
-    path = cell_path(folder, cell, turn)
+    path = cell_path(folder, cell)
     try:
         found = read_json(path.with_suffix(".json"))
     except InputError:
@@ -207,9 +203,9 @@ def fitted_cell(folder: Path, plan: ScenePlan, cell: int, turn: int) -> dict[str
     return found if isinstance(found, dict) and found.get("key") == plan.key and path.is_file() else None
 
 
-def missing(folder: Path, plan: ScenePlan, turn: int) -> list[int]:
+def missing(folder: Path, plan: ScenePlan) -> list[int]:
     """The cells that are not fitted yet."""
-    return [cell for cell in range(plan.count) if fitted_cell(folder, plan, cell, turn) is None]
+    return [cell for cell in range(plan.count) if fitted_cell(folder, plan, cell) is None]
 
 
 def remove_pixels(folder: Path) -> None:
@@ -218,21 +214,21 @@ def remove_pixels(folder: Path) -> None:
         remove(path)
 
 
-def fit_cell_of(argument: tuple[str, int, int], progress: Progress, ticks: Callable[[], float] = time.perf_counter) -> dict[str, Any]:
+def fit_cell_of(argument: tuple[str, int], progress: Progress, ticks: Callable[[], float] = time.perf_counter) -> dict[str, Any]:
     """Fit a cell, and write it into the scene's folder: the task of a worker.
 
     Args:
-        argument: the folder, the cell, and which of `ROUNDS` it is.
+        argument: the folder, and the cell.
 
     Raises:
         InputError: the folder cannot be read. OutputError: it cannot be written.
         Interrupted: it was stopped before the cell was done.
     """
-    folder, cell, turn = Path(argument[0]), argument[1], argument[2]
+    folder, cell = Path(argument[0]), argument[1]
     plan = read_plan(folder)
     if plan is None:
         raise InputError(f"{folder / PLAN} is not there or damaged; start the run again")
-    if (known := fitted_cell(folder, plan, cell, turn)) is not None:
+    if (known := fitted_cell(folder, plan, cell)) is not None:
         return known
     coarse, cells, _ = coarse_of(folder, plan.key)
     settings = load_settings(plan.settings["preset"], stored=plan.settings)
@@ -240,38 +236,24 @@ def fit_cell_of(argument: tuple[str, int, int], progress: Progress, ticks: Calla
         names = ("colour", "places", "starts", "distance", "camera", "pose")
         pool = PixelPool.of([file.get_tensor(name) for name in names], int(file.metadata()["height"]))
     warm_up(replace(settings, device="cpu"), progress)
-    start, before = (None, 0) if turn == 0 else _joined(folder, plan, cell, turn - 1)
     of_cell = CellPlan(
-        resolution=plan.resolution,
-        rays_before=plan.rays_before + int(before / max(plan.shares[cell], 1e-6)),
+        rays_before=plan.rays_before,
         share=plan.shares[cell],
         seconds=plan.seconds[cell],
         steps=None if plan.steps is None else plan.steps[cell],
-        begin=ROUNDS[turn - 1] if turn else 0.0,
-        end=ROUNDS[turn],
         slow_within=plan.slow_within,
         trust=ROUGH if plan.rough else FINE,
         opaque=plan.opaque,
-        seed=settings.seed + plan.count * turn + cell,
+        seed=settings.seed + cell,
     )
-    done: FittedCell = fit_cell(coarse, cells, cell, pool, settings, of_cell, progress, ticks, start)
+    done: FittedCell = fit_cell(coarse, cells, cell, pool, settings, of_cell, progress, ticks)
     if done.interrupted:
         raise Interrupted
-    path = cell_path(folder, cell, turn)
+    path = cell_path(folder, cell)
     done.field.save(path)
     facts = {"key": plan.key, "seconds": round(done.seconds, 3), "steps": done.steps, "rays": done.rays, "voxels": done.field.voxels}
     write_json(path.with_suffix(".json"), facts)
     return facts
-
-
-def _joined(folder: Path, plan: ScenePlan, cell: int, turn: int) -> tuple[Field, int]:
-    """The region of a cell as round `turn` left it, the halo as its neighbours have it; and the cell's rays so far."""
-    coarse, cells, _ = coarse_of(folder, plan.key)
-    rays = sum((fitted_cell(folder, plan, cell, one) or {"rays": 0})["rays"] for one in range(turn + 1))
-    fields = {other: Field.load(cell_path(folder, other, turn)) for other in cells.neighbours(cell)}
-    whole = merged(coarse, cells, fields)
-    inside = cells.in_region(whole.topology.keys.numpy().astype(np.int64), whole.resolution // coarse.resolution, cell)
-    return pruned(whole, torch.from_numpy(inside).repeat_interleave(BLOCK**3)).settled(), rays
 
 
 def merge_scene(folder: Path, plan: ScenePlan) -> tuple[Field, list[str]]:
@@ -281,8 +263,7 @@ def merge_scene(folder: Path, plan: ScenePlan) -> tuple[Field, list[str]]:
         NotCoveredError: a part of the scene is missing. InputError: a file cannot be read.
     """
     coarse, cells, rays = coarse_of(folder, plan.key)
-    last = len(ROUNDS) - 1
-    if absent := missing(folder, plan, last):
+    if absent := missing(folder, plan):
         raise NotCoveredError(f"{len(absent)} of {plan.count} cells are not fitted; start the run again, and it fits them")
-    field = merged(coarse, cells, {cell: Field.load(cell_path(folder, cell, last)) for cell in range(plan.count)})
+    field = merged(coarse, cells, {cell: Field.load(cell_path(folder, cell)) for cell in range(plan.count)})
     return field, check_coverage(coarse, rays, cells, field)
