@@ -91,6 +91,7 @@ def probe(out: Path | None) -> Iterator[Path | None]:
         yield None
         return
     path = out.absolute() / f".tmp-{os.getpid()}-probe-{uuid.uuid4().hex[:8]}"
+    made = [place for place in (out.absolute(), *out.absolute().parents) if not place.exists()]
     try:
         out.mkdir(parents=True, exist_ok=True)
         path.write_bytes(b"fieldfuse")
@@ -100,6 +101,8 @@ def probe(out: Path | None) -> Iterator[Path | None]:
     finally:
         with suppress(OSError):
             path.unlink(missing_ok=True)
+            for place in made:  # a refusal leaves nothing behind
+                place.rmdir()
 
 
 CHILD = "import ray, sys; ray.init(address=sys.argv[1], logging_level='ERROR', log_to_driver=False); ray.nodes()"

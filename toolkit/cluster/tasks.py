@@ -138,7 +138,7 @@ class Workers(ABC):
     def too_large(self, task: Task) -> str | None:
         """Why no node that is there could ever run the task; None if one can."""
         nodes = self.nodes
-        if any(_times(task, node) for node in nodes):
+        if any(held(task, node) for node in nodes):
             return None
         wants = [f"{task.cpus:g} cores", *([f"{task.gpus:g} GPUs"] if task.gpus else [])]
         wants += [f"{task.memory / memory.GIB:.1f} GB of memory"] if task.memory else []
@@ -147,11 +147,11 @@ class Workers(ABC):
 
     def at_once(self, task: Task) -> int:
         """How many such tasks can run at the same time."""
-        return sum(_times(task, node) for node in self.nodes)
+        return sum(held(task, node) for node in self.nodes)
 
 
-def _times(task: Task, node: Node) -> int:
-    """How many such tasks a node holds."""
+def held(task: Task, node: Node) -> int:
+    """How many such tasks a node can run at the same time."""
     pairs = ((node.cpus, task.cpus), (node.gpus, task.gpus), (node.memory, task.memory))
     return int(min((there / wanted for there, wanted in pairs if wanted), default=1))
 
