@@ -46,7 +46,7 @@ def batch(sources: Sources, out: Out, cluster: ClusterOptions, dry_run: DryRun =
 
     if is_run_folder(out):
         raise InputError(f"{out} is the folder of one run; choose another --out, in which each run gets a folder")
-    runs = estimated(plan(sources, options))
+    runs = estimated(plan(sources, options), seconds=dry_run)
     if dry_run:
         with open_workers(cluster.address, pool=False) as workers:
             data = {"runs": [described(one, cluster, workers, len(runs)) for one in runs]}

@@ -14,10 +14,11 @@ from fieldfuse.errors import FieldfuseError, InputError, brief
 from fieldfuse.pipelines.job import read_settings
 from fieldfuse.pipelines.options import RUN, Options
 from fieldfuse.pipelines.run import check, run
+from fieldfuse.pipelines.source import picture_size
 
 if TYPE_CHECKING:
+    from fieldfuse.capture.types import Capture
     from fieldfuse.config import Settings
-    from fieldfuse.evaluation.budget import Work
 
 LIST = ".csv"
 SWITCHES = {"yes": True, "true": True, "1": True, "on": True, "no": False, "false": False, "0": False, "off": False}
@@ -204,45 +205,45 @@ def _run_command() -> Any:
 # ------------------------------------------------------------------------------------------------- what a run takes
 
 
-def estimated(runs: Iterable[Planned]) -> list[Planned]:
-    """Runs with their rough seconds and memory, from what the headers of their captures say; a capture that cannot be read, whose run will
-    say why, takes next to nothing."""
-    found = [(one, *_estimate(one)) for one in runs]
-    return [replace(one, seconds=seconds, memory=size) for one, seconds, size in found]
-
-
-def _estimate(one: Planned) -> tuple[float, int]:
+def estimated(runs: Iterable[Planned], seconds: bool = False) -> list[Planned]:
+    """Runs with their rough memory, and seconds if they are wanted, from what the headers of their captures say; a capture that cannot be
+    read, whose run will say why, takes next to nothing."""
     from fieldfuse.capture.detect import read_source
-    from fieldfuse.pipelines.total_budget import work_of
 
-    settings = read_settings(one.options.settings())
-    try:
-        work = work_of(read_source(one.source), settings)
-    except FieldfuseError:
-        return START, int(BASE)
-    return run_seconds(work, settings, one.options.total_budget), run_memory(work, settings)
+    out = []
+    for one in runs:
+        settings = read_settings(one.options.settings())
+        try:
+            capture = read_source(one.source)
+            size = run_memory(capture, settings)
+            out.append(replace(one, memory=size, seconds=run_seconds(capture, settings, one.options.total_budget) if seconds else 0.0))
+        except FieldfuseError:
+            out.append(replace(one, memory=int(BASE), seconds=START))
+    return out
 
 
-def run_memory(work: Work, settings: Settings) -> int:
+def run_memory(capture: Capture, settings: Settings) -> int:
     """Bytes that a run needs at most, roughly: what libraries take, all images at the size of the fit, one as it lies on disk."""
-    side = settings.capture.image_size or 640
-    views = work.frames * work.pixels(side)
-    return int(BASE + VIEW_BYTES * views + ORIGINAL_BYTES * work.width * work.height + (0 if work.posed else SFM))
+    width, height = (side or 640 for side in picture_size(capture))
+    frames = settings.capture.max_frames if capture.filmed else len(capture.frames)
+    shrunk = min(1.0, (settings.capture.image_size or 640) / max(width, height))
+    posed = settings.poses.source == "given" or (settings.poses.source == "auto" and capture.posed)
+    return int(BASE + VIEW_BYTES * frames * width * height * shrunk**2 + ORIGINAL_BYTES * width * height + (0 if posed else SFM))
 
 
-def run_seconds(work: Work, settings: Settings, total: float | None) -> float:
+def run_seconds(capture: Capture, settings: Settings, total: float | None) -> float:
     """Seconds of a run, roughly: by the model of `--total-budget`, where it has measured this machine, else by the number of images."""
     import psutil
 
     from fieldfuse.evaluation import budget as model
+    from fieldfuse.pipelines.total_budget import work_of
 
     if total is not None:
         return total
-    fit = float(settings.fit.budget or 60)
+    work, fit, export = work_of(capture, settings), float(settings.fit.budget or 60), settings.export
     speed = model.remembered(model.signature(settings.threads or psutil.cpu_count() or 1, settings.device))
     if speed is None:
         return fit + START + (A_FRAME if work.posed else A_FRAME_SFM) * work.frames
-    export = settings.export
     choice = model.Choice(settings.capture.image_size or 640, mesh_size=export.mesh_size)
     parts = model.predict(speed, work, choice)
     parts["export"] = model.most_export_seconds(speed, work, choice, export.mesh_views, export.video_frames) if export.formats else 0.0

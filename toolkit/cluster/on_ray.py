@@ -42,7 +42,8 @@ def _on_node(function: Function, name: str, argument: Any, board: Any) -> Outcom
     node = ray.get_runtime_context().get_node_id()
 
     def send(data: Any) -> bool:
-        return bool(ray.get(board.tell.remote(name, node, data)))
+        # Not `ray.get`: while a task waits in it, Ray gives its cores to another.
+        return bool(board.tell.remote(name, node, data).future().result())
 
     if send({"begun": True}):
         return Outcome(begun=False, node=node)
