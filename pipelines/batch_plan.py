@@ -6,14 +6,14 @@ import csv
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, get_type_hints
 
-import typer
+from pydantic import TypeAdapter, ValidationError
 
 from fieldfuse.errors import FieldfuseError, InputError, brief
 from fieldfuse.pipelines.job import read_settings
 from fieldfuse.pipelines.options import RUN, Options
-from fieldfuse.pipelines.run import check, run
+from fieldfuse.pipelines.run import check
 from fieldfuse.pipelines.source import picture_size
 
 if TYPE_CHECKING:
@@ -21,7 +21,6 @@ if TYPE_CHECKING:
     from fieldfuse.config import Settings
 
 LIST = ".csv"
-SWITCHES = {"yes": True, "true": True, "1": True, "on": True, "no": False, "false": False, "0": False, "off": False}
 MOST_ROWS, LONGEST_NAME = 100_000, 120
 RESERVED = {"batch.json", "batch.html", "logs"}
 COLUMNS = tuple(name for name in RUN.split() if name not in ("quiet", "json"))
@@ -170,36 +169,21 @@ def _row(cells: dict[str, str], where: str, folder: Path, options: Options) -> P
     if name and (name in RESERVED or name.startswith(".") or "/" in name or "\0" in name or len(name) > LONGEST_NAME):
         raise InputError(f"{where} has the name {brief(name)!r}, which cannot be that of a folder here; use letters, digits and hyphens")
     given: dict[str, Any] = {}
-    parameters = {parameter.name: parameter for parameter in _run_command().params}
+    kinds = get_type_hints(Options)
     for column, text in cells.items():
         if column in ("source", "name") or not text:
             continue
         if column == "pairs":
             given["pairs"] = [*(options.pairs or []), *(pair.strip() for pair in text.split(";") if pair.strip())]
             continue
-        given[column] = _value(text, parameters[column], f"{where}: {column.replace('_', '-')} is {brief(text)!r}")
-        if column == "config":
-            given[column] = folder / text
+        try:
+            value = TypeAdapter(kinds[column]).validate_python(text)
+        except ValidationError as error:
+            reason = error.errors(include_url=False)[0]["msg"]
+            shown = column.replace("_", "-")
+            raise InputError(f"{where}: {shown} is {brief(text)!r}, which is not usable ({reason}); correct it") from error
+        given[column] = folder / value if column == "config" else value
     return Planned(name, folder / cells["source"], replace(options, **given), where)
-
-
-def _value(text: str, parameter: Any, wrong: str) -> Any:
-    """A cell as the command line reads an option."""
-    if parameter.is_flag:
-        if text.lower() not in SWITCHES:
-            raise InputError(f"{wrong}; write yes or no")
-        return SWITCHES[text.lower()]
-    try:
-        return parameter.type.convert(text, parameter, None)
-    except typer.BadParameter as error:
-        raise InputError(f"{wrong}, which is not usable ({error.message.rstrip('.')})") from error
-
-
-def _run_command() -> Any:
-    """`fieldfuse run` with its options, to read values as the command line does."""
-    app = typer.Typer(add_completion=False)
-    app.command()(run)
-    return typer.main.get_command(app)
 
 
 # ------------------------------------------------------------------------------------------------- what a run takes
