@@ -30,7 +30,7 @@ from fieldfuse.progress import Progress
 from fieldfuse.simulate.settings import scene_file
 from fieldfuse.simulate.simulate import simulate
 
-FILM = {"scene": "table", "output": "photos", "camera": {"width": 160, "height": 120}, "path": {"kind": "orbit", "frames": 16}}
+FILM = {"scene": "table", "camera": {"width": 160, "height": 120}, "path": {"kind": "orbit", "frames": 16}}
 OPTIONS = ("--threads", "1", "--init", "classical", "--budget", "600", "--set", "effects=off", "--set", "export.formats=[points]")
 FIT = ("--set", "fit.passes=null", "--set", "fit.depth_from=off", "--set", "field.resolution=64")
 TIMED = "seconds"  # what entries of scores have in their names that are times

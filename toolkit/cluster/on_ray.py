@@ -14,7 +14,7 @@ from fieldfuse.cluster.tasks import Function, Link, Listener, News, Node, Outcom
 from fieldfuse.errors import InputError, first_line
 
 EXAMINE = 120.0  # seconds in which each node must have looked at its versions and storage: its first worker imports this package
-TICK = 0.25  # seconds between two looks at what tasks say
+TICK = 0.5  # seconds between two looks at what tasks say
 
 
 class _Board:
