@@ -141,6 +141,9 @@ def require_answer(address: str) -> None:
     if any("Version mismatch" in line for line in lines):
         versions = " ".join(line for line in lines if line.startswith(("Ray:", "Python:", "This process")))
         raise InputError(f"the cluster at {address} has another version than this machine ({versions[:200]}); install the same on both")
+    if any("AuthenticationError" in line or "InvalidAuthToken" in line for line in lines):
+        where = "~/.ray/auth_token here, and set RAY_AUTH_MODE=token"
+        raise InputError(f"the cluster at {address} wants its token; put what `ray get-auth-token` prints at its head into {where}")
     if address == "auto" and any("Could not find any running Ray" in line for line in lines):
         raise InputError("no Ray runs on this machine; start it (ray start --head, or ray start --address HOST:PORT), or give no --address")
     if any(word in line for line in lines for word in ("node_ip_address", "Can't find", "no raylet", "this node")):
