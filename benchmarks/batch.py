@@ -42,7 +42,7 @@ TITLES = ("captures", "reports equal to single runs'", "failed, with a sentence"
 def batch(
     out: Out,
     captures: Annotated[int, typer.Option(min=3, max=200, help="Captures, one of which is broken.")] = 24,
-    iterations: Annotated[int, typer.Option(min=1, help="Steps of each fit.")] = 300,
+    iterations: Annotated[int, typer.Option(min=1, help="Steps of each fit.")] = 1000,
     quiet: Quiet = False,
 ) -> None:
     """Run captures one by one and as a batch; compare scores and processor time."""

@@ -17,8 +17,12 @@ from fieldfuse.files import read_json, remove
 from fieldfuse.poses import child
 from fieldfuse.progress import Progress
 
-# As `python -m fieldfuse run`, but it ends with the worker: else the next attempt would find its folder locked.
-RUN = "from fieldfuse.poses.child import die_with_parent; die_with_parent(); from fieldfuse.pipelines.cli import program; program()"
+# As `python -m fieldfuse run`, but it ends with the worker: else the next attempt would find its folder locked. And it hears Ctrl-C, which
+# Ray keeps from its workers and so from their children.
+RUN = (
+    "import signal; signal.signal(signal.SIGINT, signal.default_int_handler); signal.pthread_sigmask(signal.SIG_UNBLOCK, [signal.SIGINT]); "
+    "from fieldfuse.poses.child import die_with_parent; die_with_parent(); from fieldfuse.pipelines.cli import program; program()"
+)
 MARK = "fieldfuse: "  # what the one sentence of an error begins with
 STOPPED = 130
 SCORES = ("psnr", "ssim", "lpips")

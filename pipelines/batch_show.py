@@ -53,7 +53,8 @@ class LiveTable(Shown):
         from rich.console import Console
         from rich.live import Live
 
-        self._live = Live(console=Console(file=self.stream, highlight=False), get_renderable=self._table, refresh_per_second=2)
+        self._console = Console(file=self.stream, highlight=False)
+        self._live = Live(console=self._console, get_renderable=self._table, refresh_per_second=2)
         self._live.start()
 
     def _table(self) -> Table:
@@ -64,7 +65,7 @@ class LiveTable(Shown):
         out = Table(box=box.SIMPLE_HEAD)
         for name in ("run", "state", "stage", "left", "PSNR", "node"):
             out.add_column(name, overflow="ellipsis", no_wrap=name != "stage", justify="right" if name in ("left", "PSNR") else "left")
-        room = max(3, self._live.console.height - AROUND)
+        room = max(3, self._console.height - AROUND)
         rows = sorted(self.rows, key=lambda row: ORDER[row["state"]])
         for row in rows[:room]:
             stage = row["error"] or " ".join([row["stage"] or "", "" if row["share"] is None else f"{row['share']}%"])
@@ -75,7 +76,7 @@ class LiveTable(Shown):
         return out
 
     def say(self, text: str) -> None:
-        self._live.console.print(text, markup=False)
+        self._console.print(text, markup=False)
 
     def close(self) -> None:
         self._live.stop()

@@ -19,9 +19,11 @@ from fieldfuse.errors import InputError
 from fieldfuse.files import read_json
 from fieldfuse.pipelines.batch_plan import plan
 from fieldfuse.pipelines.batch_run import understood
+from fieldfuse.pipelines.batch_show import make_shown
 from fieldfuse.pipelines.options import Options, words
 from tests.pipelines.made import call, command, environment, make_room, said
 from tests.pipelines.short import HUNG, wait_for
+from tests.pipelines.test_console import Terminal
 
 Capsys = pytest.CaptureFixture[str]
 # So many steps, not seconds; nothing that takes long.
@@ -123,6 +125,22 @@ def test_what_a_run_writes_is_understood() -> None:
     assert understood("fieldfuse: no such capture") is None and understood("a line of a library") is None
 
 
+def test_the_table_of_a_terminal(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("TERM", "xterm")
+    monkeypatch.setenv("COLUMNS", "100")
+    at_work = {"name": "[b]", "state": "running", "stage": "field", "share": 43, "left": "0:12", "psnr": 24.3, "node": "vm", "error": None}
+    failed = {**at_work, "name": "a", "state": "failed", "stage": None, "share": None, "left": None, "psnr": None, "error": "no such capture"}
+    stream, stops = Terminal(), []
+    shown = make_shown([failed, at_work], lambda: stops.append(1), quiet=False, stream=stream)
+    shown.request_stop()
+    shown.say("stopping")
+    shown.close()
+    text = stream.getvalue()
+    assert all(word in text for word in ("[b]", "field 43%", "0:12", "24.30", "no such capture", "1 running, 1 failed", "stopping"))
+    assert text.rindex("[b]") < text.rindex("no such capture") and stops == [1] and shown.stopping()
+    assert type(make_shown([], lambda: None, quiet=True)).__name__ == "Shown"
+
+
 # ------------------------------------------------------------------------------------------------- runs
 
 
@@ -203,15 +221,16 @@ def started(*arguments: object) -> subprocess.Popen[str]:
 
 
 def test_ctrl_c_once_lets_the_stage_end_and_the_next_call_goes_on(rooms: Path, tmp_path: Path, capsys: Capsys) -> None:
-    arguments = ["batch", rooms / "a", "--out", tmp_path]
+    arguments = ["batch", rooms / "a", rooms / "b", "--out", tmp_path]
     process = started(*arguments, *ENDLESS)
-    wait_for(tmp_path / "a" / "stages" / "views.json", process)
+    for name in ("a", "b") if has_ray() else ("a",):
+        wait_for(tmp_path / name / "stages" / "views.json", process)
     process.send_signal(signal.SIGINT)
     _, err = process.communicate(timeout=HUNG)
     assert process.returncode == 130 and "Traceback" not in err, err
     assert err.splitlines()[-1].startswith("fieldfuse: stopped on request; what was finished is kept, run the same command again")
-    assert rows(tmp_path)["a"]["state"] == "stopped"
-    answer = call(capsys, *arguments, *SHORT)
+    assert [row["state"] for row in rows(tmp_path).values()] == ["stopped", "stopped" if has_ray() else "waiting"]
+    answer = call(capsys, *arguments[:2], *arguments[3:], *SHORT)
     assert answer.code == 0 and rows(tmp_path)["a"]["state"] == "done"
     assert read_json(tmp_path / "a" / "report.json")["stages"][0]["cached"]
 

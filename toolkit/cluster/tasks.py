@@ -17,7 +17,7 @@ from fieldfuse.cluster.checks import probe
 from fieldfuse.errors import FieldfuseError, first_line
 from fieldfuse.progress import Progress
 
-LISTEN = 1.0  # seconds between two questions of a task whether it is to stop
+LISTEN = 2.0  # seconds between two questions of a task whether it is to stop
 RETRIES = 3
 
 
