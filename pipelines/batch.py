@@ -180,15 +180,15 @@ class Batch:
             self.write()
 
             def listen(news: News) -> None:
-                row, before = self.entries[news.task].row, self.entries[news.task].row["state"]
-                data = {"state": "running", "node": news.node}
-                row |= data | {key: value for key, value in news.data.items() if key in row and (key != "psnr" or value is not None)}
-                if before != "running":
-                    shown.changed(row, before)
+                row = self.entries[news.task].row
+                row |= {"state": "running", "node": news.node}
+                row |= {key: value for key, value in news.data.items() if key in row and (key != "psnr" or value is not None)}
+                if "begun" in news.data:  # also once more, elsewhere
+                    shown.changed(row)
 
             for task, outcome in workers.run(carry_out, tasks, listen):
                 self._ended(self.entries[task.name], outcome)
-                shown.changed(self.entries[task.name].row, "running")
+                shown.changed(self.entries[task.name].row)
                 self.write(PAGE_EVERY)
         return self.write()
 
@@ -221,7 +221,7 @@ class Batch:
             yield
         except FieldfuseError as error:
             row |= {"state": "failed", "error": str(error)}
-            shown.changed(row, "waiting")
+            shown.changed(row)
 
     def _ended(self, entry: Entry, outcome: Outcome) -> None:
         """Note how a run ended."""

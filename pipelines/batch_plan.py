@@ -28,7 +28,7 @@ OTHER_NAMES = {"set": "pairs"}  # columns that are not called as the option's pa
 GIB = 2**30
 # Measured (docs/cluster.md): libraries and kernels; a pixel of an image at the size of the fit with what is
 # made of it, its share of a field that is as fine as the images are worth included; a pixel as it lies on disk, where it is decoded.
-BASE, VIEW_BYTES, ORIGINAL_BYTES = 0.8 * GIB, 40, 60
+BASE, VIEW_BYTES, ORIGINAL_BYTES = 1.0 * GIB, 40, 60
 SFM = 0.5 * GIB  # for structure from motion besides
 # Rough seconds beside the fit where this machine was not measured yet (`--total-budget` measures it): whatever it is of, and for an image.
 START, A_FRAME, A_FRAME_SFM = 15.0, 0.3, 1.5

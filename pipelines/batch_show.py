@@ -30,14 +30,14 @@ class Shown(ConsoleProgress):
         super().request_stop()
         self._passed_on()
 
-    def changed(self, row: Row, before: str) -> None:
-        """A run's state was `before`, and is another now."""
+    def changed(self, row: Row) -> None:
+        """A run was begun, or has ended."""
 
 
 class Lines(Shown):
     """A line whenever a run begins or ends."""
 
-    def changed(self, row: Row, before: str) -> None:
+    def changed(self, row: Row) -> None:
         self.say(line(row))
 
     def say(self, text: str) -> None:

@@ -129,7 +129,7 @@ def test_the_table_of_a_terminal(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("TERM", "xterm")
     monkeypatch.setenv("COLUMNS", "100")
     at_work = {"name": "[b]", "state": "running", "stage": "field", "share": 43, "left": "0:12", "psnr": 24.3, "node": "vm", "error": None}
-    failed = {**at_work, "name": "a", "state": "failed", "stage": None, "share": None, "left": None, "psnr": None, "error": "no such capture"}
+    failed = {**at_work, **dict.fromkeys(("stage", "share", "left", "psnr")), "name": "a", "state": "failed", "error": "no such capture"}
     stream, stops = Terminal(), []
     shown = make_shown([failed, at_work], lambda: stops.append(1), quiet=False, stream=stream)
     shown.request_stop()

@@ -129,7 +129,10 @@ class Workers(ABC):
 
     @abstractmethod
     def run(self, function: Function, tasks: Sequence[Task], listen: Listener | None = None) -> Iterator[tuple[Task, Outcome]]:
-        """Each task with its outcome, in the order in which they end. `listen` gets what they say, and hears nothing of None."""
+        """Each task with its outcome, in the order in which they end.
+
+        `listen` gets what they say, and `{"begun": True}` whenever one begins, or begins again because its worker was lost.
+        """
 
     def stop(self) -> None:
         """No task begins any more, and `Link.stopping` is true in those that run. May be called by a signal's handler."""
@@ -184,6 +187,7 @@ class Here(Workers):
                     listen(News(name, self._node.name, data))
                 return self.stopped
 
+            send({"begun": True})
             yield task, replace(call(function, task.argument, Link(send)), node=self._node.name)
 
 
