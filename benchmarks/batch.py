@@ -37,7 +37,7 @@ FIT = ("--set", "fit.passes=null", "--set", "fit.depth_from=off", "--set", "fiel
 TIMED = "seconds"  # what entries of scores have in their names that are times
 EVERY = 0.1  # seconds between two looks at all processes
 DEATHS = 2
-TITLES = ("captures", "reports equal to single runs'", "failed, with a sentence", "exit code", "worker killed", "single runs", "Ray and the rest")
+TITLES = ("captures", "equal to single runs", "failed, with a sentence", "exit code", "worker killed", "single runs", "Ray and the rest")
 
 
 def batch(

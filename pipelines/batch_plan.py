@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any, get_type_hints
 
 from pydantic import TypeAdapter, ValidationError
 
-from fieldfuse.errors import FieldfuseError, InputError, brief
+from fieldfuse.errors import InputError, brief
 from fieldfuse.pipelines.job import read_settings
 from fieldfuse.pipelines.options import RUN, Options
 from fieldfuse.pipelines.run import check
@@ -201,7 +201,7 @@ def estimated(runs: Iterable[Planned], seconds: bool = False) -> list[Planned]:
             capture = read_source(one.source)
             size = run_memory(capture, settings)
             out.append(replace(one, memory=size, seconds=run_seconds(capture, settings, one.options.total_budget) if seconds else 0.0))
-        except FieldfuseError:
+        except Exception:  # whatever is wrong with it, its own run says so
             out.append(replace(one, memory=int(BASE), seconds=START))
     return out
 
