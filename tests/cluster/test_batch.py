@@ -112,7 +112,7 @@ def test_a_dry_run_prices_and_starts_nothing(rooms: Path, tmp_path: Path, capsys
     answer = call(capsys, "batch", rooms / "a", rooms / "b", "--out", tmp_path / "out", "--budget", "30", "--dry-run")
     assert answer.code == 0, answer.err
     first, second, whole = answer.out.splitlines()
-    assert first.startswith(f"a: {rooms / 'a'} (--budget 30.0), about ") and "MB of memory" in first and second.startswith("b: ")
+    assert first.startswith(f"a: {rooms / 'a'} (--budget 30.0), about ") and "GB of memory" in first and second.startswith("b: ")
     assert whole.startswith("2 runs, ") and " at once with " in whole
     assert not (tmp_path / "out").exists()
 
@@ -161,6 +161,7 @@ def rows(out: Path) -> dict[str, dict[str, Any]]:
     return {row["name"]: row for row in read_json(out / "batch.json")["runs"]}
 
 
+@pytest.mark.slow
 def test_runs_on_a_cluster_are_single_runs_and_failures_cost_no_other(
     cluster: Any, rooms: Path, single: dict[str, Any], tmp_path: Path, capsys: Capsys
 ) -> None:
@@ -220,6 +221,7 @@ def started(*arguments: object) -> subprocess.Popen[str]:
     return subprocess.Popen(command(*arguments), stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, env=environment())
 
 
+@pytest.mark.slow
 def test_ctrl_c_once_lets_the_stage_end_and_the_next_call_goes_on(rooms: Path, tmp_path: Path, capsys: Capsys) -> None:
     arguments = ["batch", rooms / "a", rooms / "b", "--out", tmp_path]
     process = started(*arguments, *ENDLESS)
