@@ -46,7 +46,8 @@ def fit_in_cells(job: Job, views: Views, scene: Scene, begin: Begin) -> FitResul
     key = fingerprint(inputs, asdict(settings.field), asdict(settings.fit), settings.seed, settings.preset)
     plan = cells.read_plan(folder)
     if plan is None or plan.key != key or cells.missing(folder, plan):
-        with open_workers(settings.address, cpus=settings.threads) as workers:  # a cluster that cannot be used is known before the coarse fit
+        # A cluster that cannot be used is to be known before the coarse fit, not after it.
+        with open_workers(settings.address, cpus=settings.threads) as workers:
             workers.check(folder)
             if plan is None or plan.key != key:
                 for file in folder.iterdir():

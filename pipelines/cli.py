@@ -18,6 +18,7 @@ import typer
 from fieldfuse import __version__
 from fieldfuse.errors import FieldfuseError, Interrupted
 from fieldfuse.pipelines.bake import bake
+from fieldfuse.pipelines.batch import batch
 from fieldfuse.pipelines.compare import compare
 from fieldfuse.pipelines.doctor import doctor
 from fieldfuse.pipelines.evaluate import evaluate
@@ -56,7 +57,7 @@ def _all(version: Annotated[bool, typer.Option("--version", callback=_version, i
     pass
 
 
-for _command in (doctor, run, poses, tsdf, finetune, render, view, export, bake, evaluate, compare, tradeoff, info, train, simulate):
+for _command in (doctor, run, batch, poses, tsdf, finetune, render, view, export, bake, evaluate, compare, tradeoff, info, train, simulate):
     # In the list of commands their first sentences are wrapped like this, and cut off otherwise.
     app.command(short_help=" ".join((inspect.getdoc(_command) or "").partition("\n\n")[0].split()))(_command)
 

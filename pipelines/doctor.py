@@ -52,6 +52,7 @@ EXTRAS = (
     ("las", "laspy", "points are not written as LAS and LAZ", "laspy[lazrs]>=2.5"),
     ("e57", "pye57", "points are not written as E57", "pye57>=0.4.1"),
     ("usd", "usd-core", "the textured mesh is not written as USDZ", "usd-core>=25.2"),
+    ("cluster", "ray", "`fieldfuse batch` makes one run after the other, and on this machine alone", "ray>=2.40"),
     ("h264", "av", "videos are written as VP9, slowly, which not all players know", "av>=14"),
 )
 GIB = 2**30

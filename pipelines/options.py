@@ -117,6 +117,43 @@ FLAGS = (
 )
 
 
+@dataclass(frozen=True)
+class ClusterOptions:
+    """Where the tasks of a command run, and what is reserved for each."""
+
+    address: Annotated[str | None, option("Ray cluster: auto, or HOST:PORT; default: this machine.")] = None
+    cpus_per_run: Annotated[int | None, option("Cores for a run; default: as many as there are for each.", min=1)] = None
+    gpus_per_run: Annotated[float | None, option("GPUs for a run, also parts of one; default 0, or 1 with --device cuda.", min=0)] = None
+    memory_per_run: Annotated[float | None, option("GB reserved for a run; default: estimated from the capture.", min=0.01)] = None
+    retries: Annotated[int, typer.Option(help="How often a run goes on elsewhere when its worker is lost.", min=0)] = 3
+    timeout: Annotated[float | None, option("Seconds after which a run is ended and counts as failed.", min=1)] = None
+    upload: Annotated[bool, typer.Option("--upload", help="Send captures and results through Ray, without shared storage.")] = False
+
+
+RUN = (  # those of `run`, in the order of its help
+    "preset budget total_budget image_size holdout device threads seed engine decoder init finetune poses depth_scale scale marker config "
+    "pairs quiet json"
+)
+
+
+def words(options: Options) -> list[str]:
+    """Options as a command line has them, without those that say how much is shown; what is not given is left out."""
+    out: list[str] = []
+    hints = get_type_hints(Options, include_extras=True)
+    for name in RUN.split():
+        value = getattr(options, name)
+        if value is None or name in ("quiet", "json"):
+            continue
+        # In an annotation typer's first argument, `default`, is the option's name, if that is not its parameter's.
+        named = next((one.default for one in hints[name].__metadata__ if isinstance(one.default, str)), f"--{name.replace('_', '-')}")
+        if isinstance(value, bool):
+            out.append(named.split("/")[0 if value else 1])
+            continue
+        for one in value if isinstance(value, list) else [value]:
+            out += [named, str(one)]
+    return out
+
+
 def gather(preset: str | None = None, config: Path | None = None, pairs: list[str] | None = None, **flags: Any) -> dict[str, Any]:
     """Options by name → what `fieldfuse.pipelines.job.read_settings` takes."""
     return {"preset": preset, "config": config, "pairs": list(pairs or []), "flags": flags}

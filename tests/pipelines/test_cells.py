@@ -14,7 +14,8 @@ from fieldfuse.training.cells import scene as cells
 from tests.pipelines.made import make_room, said
 from tests.pipelines.short import SMALL, steady
 
-OPTIONS = [*SMALL, "--budget", "1000", "--set", "field.resolution=128", "--cells", "3", "--set", "fit.iterations=300", "--set", "export.formats=[]"]
+LATTICE = ["--budget", "1000", "--set", "field.resolution=64", "--set", "fit.iterations=300"]
+OPTIONS = [*SMALL, *LATTICE, "--cells", "3", "--set", "export.formats=[]"]
 
 
 def workers_here(address: str | None, **_: object) -> AbstractContextManager[Workers]:

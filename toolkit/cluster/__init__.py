@@ -23,10 +23,10 @@ from typing import Any
 
 from fieldfuse.cluster.checks import require_answer
 from fieldfuse.cluster.on_ray import Cluster
-from fieldfuse.cluster.tasks import RETRIES, Here, Link, Listener, News, Node, Outcome, Task, Workers
+from fieldfuse.cluster.tasks import RETRIES, Here, Link, Listener, News, Node, Outcome, Task, Workers, held
 from fieldfuse.extras import extra
 
-__all__ = ["RETRIES", "Link", "Listener", "News", "Node", "Outcome", "Task", "Workers", "has_ray", "open_workers"]
+__all__ = ["RETRIES", "Link", "Listener", "News", "Node", "Outcome", "Task", "Workers", "has_ray", "held", "open_workers"]
 STORE = 256 * 2**20  # bytes of Ray's object store on a pool of this machine: tasks pass paths
 
 

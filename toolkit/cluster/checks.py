@@ -91,6 +91,7 @@ def probe(out: Path | None) -> Iterator[Path | None]:
         yield None
         return
     path = out.absolute() / f".tmp-{os.getpid()}-probe-{uuid.uuid4().hex[:8]}"
+    made = [place for place in (out.absolute(), *out.absolute().parents) if not place.exists()]
     try:
         out.mkdir(parents=True, exist_ok=True)
         path.write_bytes(b"fieldfuse")
@@ -100,6 +101,8 @@ def probe(out: Path | None) -> Iterator[Path | None]:
     finally:
         with suppress(OSError):
             path.unlink(missing_ok=True)
+            for place in made:  # a refusal leaves nothing behind
+                place.rmdir()
 
 
 CHILD = "import ray, sys; ray.init(address=sys.argv[1], logging_level='ERROR', log_to_driver=False); ray.nodes()"
@@ -138,6 +141,9 @@ def require_answer(address: str) -> None:
     if any("Version mismatch" in line for line in lines):
         versions = " ".join(line for line in lines if line.startswith(("Ray:", "Python:", "This process")))
         raise InputError(f"the cluster at {address} has another version than this machine ({versions[:200]}); install the same on both")
+    if any("AuthenticationError" in line or "InvalidAuthToken" in line for line in lines):
+        where = "~/.ray/auth_token here, and set RAY_AUTH_MODE=token"
+        raise InputError(f"the cluster at {address} wants its token; put what `ray get-auth-token` prints at its head into {where}")
     if address == "auto" and any("Could not find any running Ray" in line for line in lines):
         raise InputError("no Ray runs on this machine; start it (ray start --head, or ray start --address HOST:PORT), or give no --address")
     if any(word in line for line in lines for word in ("node_ip_address", "Can't find", "no raylet", "this node")):

@@ -14,7 +14,7 @@ from fieldfuse.cluster.tasks import Function, Link, Listener, News, Node, Outcom
 from fieldfuse.errors import InputError, first_line
 
 EXAMINE = 120.0  # seconds in which each node must have looked at its versions and storage: its first worker imports this package
-TICK = 0.25  # seconds between two looks at what tasks say
+TICK = 2.0  # seconds between two looks at what tasks say
 
 
 class _Board:
@@ -42,10 +42,12 @@ def _on_node(function: Function, name: str, argument: Any, board: Any) -> Outcom
     node = ray.get_runtime_context().get_node_id()
 
     def send(data: Any) -> bool:
-        return bool(ray.get(board.tell.remote(name, node, data)))
+        # Not `ray.get`: while a task waits in it, Ray gives its cores to another.
+        return bool(board.tell.remote(name, node, data).future().result())
 
-    if send({"begun": True}):
+    if send(None):
         return Outcome(begun=False, node=node)
+    send({"begun": True})
     return replace(call(function, argument, Link(send)), node=node)
 
 
@@ -136,7 +138,8 @@ class Cluster(Workers):
         except errors.WorkerCrashedError:
             text = f"its worker process died, {_times_over(task)}"
         except errors.RayError as error:
-            text = f"Ray could not run it: {first_line(error)}"
+            reason = getattr(error, "cause", None) or error  # of an error in the worker the text begins with where, in colours
+            text = f"Ray could not run it ({type(reason).__name__}: {first_line(reason)})"
         return Outcome(error=text, node=place)
 
 

@@ -17,7 +17,7 @@ from fieldfuse.cluster.checks import probe
 from fieldfuse.errors import FieldfuseError, first_line
 from fieldfuse.progress import Progress
 
-LISTEN = 0.5  # seconds between two questions of a task whether it is to stop
+LISTEN = 2.0  # seconds between two questions of a task whether it is to stop
 RETRIES = 3
 
 
@@ -129,7 +129,10 @@ class Workers(ABC):
 
     @abstractmethod
     def run(self, function: Function, tasks: Sequence[Task], listen: Listener | None = None) -> Iterator[tuple[Task, Outcome]]:
-        """Each task with its outcome, in the order in which they end. `listen` gets what they say, and hears nothing of None."""
+        """Each task with its outcome, in the order in which they end.
+
+        `listen` gets what they say, and `{"begun": True}` whenever one begins, or begins again because its worker was lost.
+        """
 
     def stop(self) -> None:
         """No task begins any more, and `Link.stopping` is true in those that run. May be called by a signal's handler."""
@@ -138,7 +141,7 @@ class Workers(ABC):
     def too_large(self, task: Task) -> str | None:
         """Why no node that is there could ever run the task; None if one can."""
         nodes = self.nodes
-        if any(_times(task, node) for node in nodes):
+        if any(held(task, node) for node in nodes):
             return None
         wants = [f"{task.cpus:g} cores", *([f"{task.gpus:g} GPUs"] if task.gpus else [])]
         wants += [f"{task.memory / memory.GIB:.1f} GB of memory"] if task.memory else []
@@ -147,11 +150,11 @@ class Workers(ABC):
 
     def at_once(self, task: Task) -> int:
         """How many such tasks can run at the same time."""
-        return sum(_times(task, node) for node in self.nodes)
+        return sum(held(task, node) for node in self.nodes)
 
 
-def _times(task: Task, node: Node) -> int:
-    """How many such tasks a node holds."""
+def held(task: Task, node: Node) -> int:
+    """How many such tasks a node can run at the same time."""
     pairs = ((node.cpus, task.cpus), (node.gpus, task.gpus), (node.memory, task.memory))
     return int(min((there / wanted for there, wanted in pairs if wanted), default=1))
 
@@ -184,6 +187,7 @@ class Here(Workers):
                     listen(News(name, self._node.name, data))
                 return self.stopped
 
+            send({"begun": True})
             yield task, replace(call(function, task.argument, Link(send)), node=self._node.name)
 
 

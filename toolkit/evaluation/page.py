@@ -8,7 +8,7 @@ from __future__ import annotations
 import base64
 from datetime import datetime
 from importlib import resources
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import cv2
 import numpy as np
@@ -17,7 +17,9 @@ from jinja2 import Environment, FunctionLoader, StrictUndefined
 from fieldfuse.camera import Array
 from fieldfuse.errors import OutputError
 from fieldfuse.evaluation import words
-from fieldfuse.evaluation.pictures import DEPTH_COLOURS, ERROR_COLOURS, ERROR_TOP, Pictures, coloured
+
+if TYPE_CHECKING:
+    from fieldfuse.evaluation.pictures import Pictures
 
 LONGEST = 480  # pixels of an embedded image's long side: sharp at the size it is shown, small in bytes
 QUALITY = 86
@@ -43,6 +45,8 @@ def render(name: str, data: dict[str, Any], title: str, **values: Any) -> str:
 
 def view_values(pictures: Pictures, views: list[dict[str, Any]]) -> dict[str, Any]:
     """What the section of test views shows: their `views`, the legends of errors and depths."""
+    from fieldfuse.evaluation.pictures import DEPTH_COLOURS, ERROR_COLOURS, ERROR_TOP, coloured  # with torch
+
     bar = np.broadcast_to(np.linspace(0, 1, 128), (1, 128))  # the colour map from low to high
     near, far = pictures.depth_range or (None, None)
     return {

@@ -57,12 +57,18 @@ def run_child(
 
 
 def run_logged(
-    arguments: list[str], log: Path, tick: Callable[[float], None], longest: float = math.inf, environment: dict[str, str] | None = None
+    arguments: list[str],
+    log: Path,
+    tick: Callable[[float], None],
+    longest: float = math.inf,
+    environment: dict[str, str] | None = None,
+    interrupt: Callable[[], bool] = lambda: False,
 ) -> int:
     """Run `python arguments` to its end; all that it writes goes to `log`.
 
     Args:
         tick: called again and again with the seconds that have passed; what it raises ends the child.
+        interrupt: once it is true, the child gets one Ctrl-C.
 
     Returns:
         the exit code, negative for a signal.
@@ -72,13 +78,16 @@ def run_logged(
     """
     with log.open("wb") as written:
         process = _start(arguments, written, written, environment or {})
-    start = time.monotonic()
+    start, interrupted = time.monotonic(), False
     try:
         while process.poll() is None:
             seconds = time.monotonic() - start
             if seconds > longest:
                 raise TimeoutError(f"it took longer than {longest:g} s and was ended")
             tick(seconds)
+            if not interrupted and interrupt():
+                interrupted = True
+                process.send_signal(signal.SIGINT)
             time.sleep(TICK)
     finally:
         end(process)

@@ -6,8 +6,6 @@ import time
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 
-import torch
-
 from fieldfuse.config import Settings
 from fieldfuse.progress import SILENT, Progress
 from fieldfuse.render.field import Field
