@@ -117,6 +117,8 @@ def test_the_networks_alone_give_a_field(scene: ff.Scene) -> None:
     assert score is not None and score > 12
     field = ff.fit(scene, finetune=False, init="auto", settings=settings)
     assert len(field.timeline) == 0 and ff.evaluate(field, scene).psnr == pytest.approx(score, abs=0.01)
+    with pytest.raises(ff.InputError, match="fieldfuse run SOURCE"):
+        ff.fit(scene, cells=4)
     with pytest.raises(ff.InputError, match="without fine-tuning"):
         ff.fit(scene, finetune=False)  # its start is classical
 

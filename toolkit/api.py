@@ -124,6 +124,8 @@ def fit(scene: Scene, budget: float | None = None, *, progress: Listener = None,
     from fieldfuse.volume.grid import host_for
 
     settings = changed_settings(scene.settings, {**options, **({} if budget is None else {"budget": budget})}, OF_FIT)
+    if settings.fit.cells != "off":
+        raise InputError("a scene is fitted in cells on disk, by `fieldfuse run SOURCE --out DIR --cells N`; leave cells out here")
     if not settings.fit.finetune:
         if start is not None or settings.field.init == "classical":
             raise InputError("without fine-tuning the networks' field is the result, so it has no start; leave out start or finetune=False")
