@@ -13,7 +13,7 @@ from fieldfuse.backends.numba.march import Samples, march_ray
 
 @njit(**K.OPTIONS)
 def light_held(space: Any, volume: Any, lines: Any, stop: Any, threshold: Any, owner: Any, least: Any, rays: Any, out: Any) -> None:
-    """Which groups of blocks hold at least `least` of the light of each ray.
+    """Which groups of blocks hold at least the share `least` of the light that each ray loses.
 
     Args:
         lines: (B, 6) float32 origins and unit directions; stop, threshold: see `march_ray`.
@@ -27,11 +27,13 @@ def light_held(space: Any, volume: Any, lines: Any, stop: Any, threshold: Any, o
     for ray in range(len(lines)):
         line = lines[ray, 0], lines[ray, 1], lines[ray, 2], lines[ray, 3], lines[ray, 4], lines[ray, 5]
         kept = march_ray(space, volume, line, K.ZERO, stop, threshold, marks, K.START, samples, result)
+        total = K.ZERO
         for i in range(kept):
             sums[owner[samples.cells[i] >> 9]] += samples.values[i, K.WEIGHT]
+            total += samples.values[i, K.WEIGHT]
         for i in range(kept):
             group = owner[samples.cells[i] >> 9]
-            if sums[group] >= least:
+            if sums[group] >= least * total and sums[group] > K.ZERO:
                 rays[group] += 1
                 if out.shape[0] > 0:
                     out[ray, group] = True

@@ -24,7 +24,7 @@ from fieldfuse.training.pixels import PixelPool
 
 STRIDE = 4
 WIDER = 1  # such places about one at which a cell is seen that are its pixels, too: its halo is seen there
-LEAST = 0.05  # of a ray's light: what a cell holds less of, others explain
+LEAST = 0.05  # of the light that a ray loses, be it little, as before a sky: what a cell holds less of, others explain
 
 
 class Sight:
