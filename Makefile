@@ -55,7 +55,8 @@ WORKERS ?= $(if $(filter-out 0 1,$(shell nproc 2>/dev/null)),2,0)
 
 # Types take one core most of a minute, so they are checked beside the tests; their errors count all the same.
 # Bytecode is kept, also where the environment says otherwise: tests start many processes, and each would compile what it imports.
-test: MARKED := -m "not slow"
+test-all: MARKED := -m "not long"
+test: MARKED := -m "not slow and not long"
 test test-all: $(VENV)/.installed-test links
 	$(RUFF) $(SOURCES)
 	PYTHONPATH=$(LINKS) $(BIN)/lint-imports
@@ -65,6 +66,7 @@ test test-all: $(VENV)/.installed-test links
 
 stability: $(VENV)/.installed-test
 	$(BIN)/python -m pytest tests/stability/hard --page docs/stability.md
+	$(BIN)/python -m pytest -m long tests/cluster
 	$(BIN)/python -m tests.stability kills --page docs/stability.md
 	$(BIN)/python -m tests.stability stops --page docs/stability.md
 

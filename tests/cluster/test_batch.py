@@ -221,7 +221,7 @@ def started(*arguments: object) -> subprocess.Popen[str]:
     return subprocess.Popen(command(*arguments), stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True, env=environment())
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_ctrl_c_once_lets_the_stage_end_and_the_next_call_goes_on(rooms: Path, tmp_path: Path, capsys: Capsys) -> None:
     arguments = ["batch", rooms / "a", rooms / "b", "--out", tmp_path]
     process = started(*arguments, *ENDLESS)

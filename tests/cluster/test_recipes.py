@@ -69,7 +69,7 @@ def kept(words: list[str], scratch: Path) -> Iterator[None]:
         process.wait()
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_a_pool_by_hand(tmp_path: Path) -> None:
     pytest.importorskip("ray", reason="Ray is not installed (the extra cluster)")
     for name in ("a", "b"):

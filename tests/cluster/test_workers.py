@@ -108,7 +108,7 @@ def test_stopping_lets_what_runs_end_and_begins_nothing_more(workers: Workers, t
     assert {outcome.value for outcome in begun} == {"stopped"}
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_a_task_goes_on_where_a_node_was_added(cluster: Any, connected: Workers, tmp_path: Path) -> None:
     node = {"num_cpus": 1, "resources": {}, "include_dashboard": False, "object_store_memory": 80 * 2**20, "memory": 77 * 2**30}
     there = [cluster.add_node(**node)]

@@ -72,6 +72,8 @@ from fieldfuse.simulate.simulate import simulate
 from fieldfuse.stereo.maps import save_stereo
 from fieldfuse.stereo.match import StereoDepth
 from fieldfuse.stereo.transients import LeftOut, save_left_out
+from fieldfuse.training.cells.scene import write_tensors
+from fieldfuse.training.pixels import PixelPool
 from fieldfuse.tsdf.volume import DepthFrame, TsdfVolume
 from tests.capture.layouts import write_record3d, write_sens
 from tests.evaluation.test_compare_page import made, pictures
@@ -103,6 +105,7 @@ def writers() -> dict[str, Write]:
         "write_json": lambda folder: write_json(folder / "a.json", {"x": list(range(1000))}),
         "Field.save": lambda folder: field.save(folder / "field.safetensors"),
         "save_views": lambda folder: save_views(folder / "views.safetensors", views),
+        "write_tensors": lambda folder: write_tensors(folder / "pixels.safetensors", PixelPool(views).arrays(), {"height": "48"}),
         "save_pictures": lambda folder: save_pictures(folder / "pictures.safetensors", pictures),
         "write_pngs": lambda folder: write_pngs(folder, "a", pictures, 1.0),
         "write_png": lambda folder: write_png(folder / "a.png", pixels),
@@ -221,6 +224,7 @@ ELSEWHERE = {
     "toolkit/evaluation/budget.py": "a cache: what cannot be written is not remembered",
     "toolkit/simulate/demo.py": "one video, for people, through `atomic_path`",
     "toolkit/evaluation/plots.py": "draws into memory",
+    "toolkit/cluster/checks.py": "a probe: tests/cluster puts it on a full disk",
     "pipelines/doctor.py": "a probe in a temporary folder",
 }
 

@@ -69,7 +69,7 @@ def agreement(
     """
     depth = np.ascontiguousarray(maps.depths[index], np.float32)
     agree, through = np.zeros(depth.shape, np.int32), np.zeros(depth.shape, np.int32)
-    total = np.where(depth > 0, 1 / np.maximum(depth, 1e-12), 0) if sums else NO_SUMS
+    total = np.where(depth > 0, 1 / np.maximum(depth, 1e-12, dtype=np.float64), 0) if sums else NO_SUMS
     colours = np.full((len(others) if images else 0, *depth.shape), np.nan, np.float32)
     here = _ray_matrix(maps.cameras[index])
     for number, other in enumerate(others):

@@ -132,14 +132,14 @@ def write_scene(
     # Seconds go by rays, memory by voxels: cells are to be alike in both.
     cells = cut(coarse.topology.keys.numpy(), np.sqrt(rays * voxels.astype(np.float64)), count)
     coarse.save(folder / COARSE, scene.working_from_input)
-    _write_tensors(folder / CELLS, {"keys": cells.keys, "owner": cells.owner, "rays": rays})
+    owners = {"keys": cells.keys, "owner": cells.owner, "rays": rays}
+    write_tensors(folder / CELLS, {name: torch.from_numpy(np.ascontiguousarray(values)) for name, values in owners.items()})
     whole, sizes = sum(lens.width * lens.height for lens in train.intrinsics), []
     for cell, pool in enumerate(pools(train, cells, sight, settings.fit.depth > 0)):
         progress.check()
         progress.update(cell, cells.count, "pixels of cells")
         sizes.append(len(pool))
-        with atomic_path(folder / f"pixels-{cell:03}.safetensors") as temporary:
-            save_file({name: one.contiguous() for name, one in pool.arrays().items()}, temporary, {"height": str(pool.height)})
+        write_tensors(folder / f"pixels-{cell:03}.safetensors", pool.arrays(), {"height": str(pool.height)})
     parts = [(1 - COARSE_SHARE) * size / sum(sizes) for size in sizes]
     # What a fit in one piece would have on this machine: cells have one thread each, however many are fitted side by side.
     budget, steps = (settings.fit.budget or DEFAULT_BUDGET) * (settings.threads or torch.get_num_threads()), settings.fit.iterations
@@ -161,9 +161,14 @@ def write_scene(
     return plan
 
 
-def _write_tensors(path: Path, arrays: dict[str, np.ndarray[Any, Any]]) -> None:
+def write_tensors(path: Path, tensors: dict[str, torch.Tensor], about: dict[str, str] | None = None) -> None:
+    """Write tensors by name, and remarks on them.
+
+    Raises:
+        OutputError: they cannot be written.
+    """
     with atomic_path(path) as temporary:
-        save_file({name: torch.from_numpy(np.ascontiguousarray(values)) for name, values in arrays.items()}, temporary)
+        save_file({name: values.contiguous() for name, values in tensors.items()}, temporary, about)
 
 
 def read_plan(folder: Path) -> ScenePlan | None:
