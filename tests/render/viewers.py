@@ -33,7 +33,8 @@ renderer.setSize(width, height);
 document.body.append(renderer.domElement);
 const scene = new THREE.Scene();
 scene.background = new THREE.Color().setRGB(...background, THREE.SRGBColorSpace);
-scene.add(new SparkRenderer({{renderer}}));
+// For splats that are trained as Kerbl et al. do, without opacities that make up for the blur (Spark's default).
+scene.add(new SparkRenderer({{renderer, preBlurAmount: 0.3, blurAmount: 0.0}}));
 const camera = new THREE.PerspectiveCamera();
 camera.matrixAutoUpdate = false;
 camera.matrix.fromArray(pose);
