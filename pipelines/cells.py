@@ -15,17 +15,19 @@ import torch
 from fieldfuse.capture.types import Views
 from fieldfuse.cluster import News, Task, Workers, open_workers
 from fieldfuse.errors import FieldfuseError, InputError, Interrupted
-from fieldfuse.files import fingerprint, remove
+from fieldfuse.files import fingerprint, read_json, remove, write_json
 from fieldfuse.nerfusion.decoder import Deferred
 from fieldfuse.pipelines.job import Job
 from fieldfuse.poses.scene import Scene
 from fieldfuse.render.field import Field
 from fieldfuse.render.image import make_renderer
+from fieldfuse.stereo.transients import load_left_out, save_left_out
 from fieldfuse.training.cells import scene as cells
 from fieldfuse.training.fit import TIMELINE_PIXELS, Begin, FitResult, Sample
 from fieldfuse.training.guided import fit_guided
 
 FOLDER = "cells"
+LEFT_OUT, MATCHED = "left_out.safetensors", "matched.json"  # of the coarse fit, and so of the whole
 
 
 def fit_in_cells(job: Job, views: Views, scene: Scene, begin: Begin) -> FitResult:
@@ -61,6 +63,8 @@ def fit_in_cells(job: Job, views: Views, scene: Scene, begin: Begin) -> FitResul
     seconds = plan.seconds_before + sum(facts["seconds"] for facts in known)
     result = FitResult(field, seconds=seconds, steps=sum(facts["steps"] for facts in known), notes=notes + remarks)
     result.rays = plan.rays_before + sum(facts["rays"] for facts in known)
+    result.left_out = load_left_out(folder / LEFT_OUT) if (folder / LEFT_OUT).is_file() else None
+    result.matched = read_json(folder / MATCHED) if (folder / MATCHED).is_file() else None
     shown = Sample(views, np.flatnonzero(views.test), TIMELINE_PIXELS, field.device).psnr(_Shown(field))
     result.timeline = [{"seconds": round(seconds, 3), "psnr": round(shown, 4)}] if shown is not None else []
     return result
@@ -87,6 +91,10 @@ def _cut(job: Job, folder: Path, key: str, views: Views, scene: Scene, begin: Be
             f"the coarse field came to {result.field.resolution}³ voxels and cells need {coarse.field.resolution}³; give more --budget, or "
             "leave --cells out"
         )
+    if result.left_out is not None:
+        save_left_out(folder / LEFT_OUT, result.left_out)
+    if result.matched is not None:
+        write_json(folder / MATCHED, result.matched)
     return cells.write_scene(folder, key, result, views, scene, settings, job.progress)
 
 

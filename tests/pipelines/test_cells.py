@@ -58,6 +58,7 @@ def test_cells_give_one_field_and_a_report(fitted: Path) -> None:
     field = Field.load(fitted / "field.safetensors")
     assert field.resolution == plan.resolution
     assert 0 < sum(plan.shares) < 3
+    assert (fitted / "fit_matched.json").is_file()  # of the coarse fit
     assert not list((fitted / "cells").glob("pixels-*"))
 
 
