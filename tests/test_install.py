@@ -137,7 +137,8 @@ def test_demo_and_test_share_the_steps_in_order(tmp_path: Path) -> None:
     assert demo.index("-m venv") < demo.index("pip install") < demo.index("fieldfuse.pipelines.demo")
     assert test.index("-m venv") < test.index("pip install") < test.index("ruff check") < test.index("bin/mypy") < test.index("-m pytest")
     assert "lint-imports" in test and test.index("tests.kernels") < test.index("-m pytest") and callable(kernels.main)
-    assert '-m "not slow"' in test and "not slow" not in make("--dry-run", "test-all", venv).stdout
+    everything = make("--dry-run", "test-all", venv).stdout
+    assert '-m "not slow and not long"' in test and '-m "not long"' in everything
     assert "constraint constraints.txt" in demo
 
 
