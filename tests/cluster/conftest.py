@@ -12,7 +12,7 @@ import pytest
 ROOT = Path(__file__).resolve().parents[2]
 
 
-@pytest.fixture(scope="session")
+@pytest.fixture(scope="package")  # other tests in this process look at its children
 def cluster() -> Iterator[Any]:
     pytest.importorskip("ray", reason="Ray is not installed (the extra cluster)")
     os.environ.update(RAY_USAGE_STATS_ENABLED="0", RAY_DEDUP_LOGS_SKIP_REGEX=".", PYTHONPATH=str(ROOT), OMP_NUM_THREADS="1")
