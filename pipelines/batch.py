@@ -19,16 +19,16 @@ from fieldfuse.errors import FieldfuseError, InputError, Interrupted, OutputErro
 from fieldfuse.pipelines.options import RUN, ClusterOptions, Options, Out, bound_threads, show, takes, words
 
 if TYPE_CHECKING:
-    from fieldfuse.cluster import News, Outcome, Task, Workers
+    from fieldfuse.cluster import Message, Outcome, Task, Workers
     from fieldfuse.pipelines.batch_plan import Planned
-    from fieldfuse.pipelines.batch_show import Row, Shown
+    from fieldfuse.pipelines.batch_show import Display, Row
 
 Sources = Annotated[
     list[Path], typer.Argument(help="Captures, or lists of them (.csv): a column source, name, and options of run.", show_default=False)
 ]
 DryRun = Annotated[bool, typer.Option("--dry-run", help="Say what would be run, and what it takes; start nothing.")]
 PAGE_EVERY = 2.0  # seconds between two versions of the page
-MOST_PARCEL = 2 * 2**30  # bytes of a capture that is sent
+MOST_UPLOAD = 2 * 2**30  # bytes of a capture that is sent
 GB = 1e9
 RESTING = {"stage": None, "share": None, "left": None}  # of a run that is not at work
 
@@ -168,45 +168,45 @@ class Batch:
         Raises:
             InputError, OutputError: nodes do not fit (`Workers.check`), or the page cannot be written.
         """
-        from fieldfuse.pipelines.batch_run import carry_out
-        from fieldfuse.pipelines.batch_show import make_shown
+        from fieldfuse.pipelines.batch_run import execute
+        from fieldfuse.pipelines.batch_show import make_display
 
         shared = not self.cluster.upload
         workers.check(self.out if shared else None, [entry.planned.source for entry in self.todo] if shared else [])
         rows = [entry.row for entry in self.entries.values()]
-        shown = make_shown(rows, workers.stop, quiet)
+        shown = make_display(rows, workers.stop, quiet)
         with shown.listening():
-            tasks = self._orders(workers, shown)
+            tasks = self._specs(workers, shown)
             self.write()
 
-            def listen(news: News) -> None:
+            def listen(news: Message) -> None:
                 row = self.entries[news.task].row
                 row |= {"state": "running", "node": news.node}
                 row |= {key: value for key, value in news.data.items() if key in row and (key != "psnr" or value is not None)}
                 if "begun" in news.data:  # also once more, elsewhere
                     shown.changed(row)
 
-            for task, outcome in workers.run(carry_out, tasks, listen):
+            for task, outcome in workers.run(execute, tasks, listen):
                 self._ended(self.entries[task.name], outcome)
                 shown.changed(self.entries[task.name].row)
                 self.write(PAGE_EVERY)
         return self.write()
 
-    def _orders(self, workers: Workers, shown: Shown) -> list[Task]:
+    def _specs(self, workers: Workers, shown: Display) -> list[Task]:
         """Tasks of the runs that can be made; others are failed already."""
-        from fieldfuse.pipelines.batch_run import Order
+        from fieldfuse.pipelines.batch_run import RunSpec
 
         planned = [entry.planned for entry in self.todo]
         count, longest = cores(self.cluster, workers, len(planned)), self.cluster.timeout or math.inf
-        orders: dict[str, Order] = {}
+        specs: dict[str, RunSpec] = {}
         for one in planned:
             given = words(one.options) + ([] if one.options.threads is not None else ["--threads", str(count)])
             place, log = self.out / one.name, self.out / "logs" / f"{one.name}.log"
             with self._failing(one.name, shown):
-                parcel = parcel_of(one, place) if self.cluster.upload else None
-                orders[one.name] = Order(str(one.source.absolute()), str(place), tuple(given), str(log), longest, parcel)
-        ready = [one for one in planned if one.name in orders]
-        tasks = tasks_of(ready, self.cluster, workers, [orders[one.name] for one in ready])
+                upload = upload_of(one, place) if self.cluster.upload else None
+                specs[one.name] = RunSpec(str(one.source.absolute()), str(place), tuple(given), str(log), longest, upload)
+        ready = [one for one in planned if one.name in specs]
+        tasks = tasks_of(ready, self.cluster, workers, [specs[one.name] for one in ready])
         for task in tasks:
             with self._failing(task.name, shown):
                 if (refusal := workers.too_large(task)) is not None:
@@ -214,7 +214,7 @@ class Batch:
         return [task for task in tasks if self.entries[task.name].row["state"] != "failed"]
 
     @contextmanager
-    def _failing(self, name: str, shown: Shown) -> Iterator[None]:
+    def _failing(self, name: str, shown: Display) -> Iterator[None]:
         """What is refused here costs this run only."""
         row = self.entries[name].row
         try:
@@ -285,13 +285,13 @@ def earlier(out: Path) -> dict[str, Row]:
         return {}
 
 
-def parcel_of(one: Planned, folder: Path) -> Any:
+def upload_of(one: Planned, folder: Path) -> Any:
     """The files that travel with a run.
 
     Raises:
         InputError: there is no source, it is too large, or it is a file that stands for others beside it.
     """
-    from fieldfuse.pipelines.batch_run import Parcel, pack
+    from fieldfuse.pipelines.batch_run import Upload, pack
 
     source = one.source
     if not source.exists():
@@ -299,9 +299,9 @@ def parcel_of(one: Planned, folder: Path) -> Any:
     if source.suffix.lower() == ".json":
         raise InputError(f"{source} names files beside it, which --upload would not send; give its folder")
     size = sum(path.stat().st_size for path in ([source] if source.is_file() else source.rglob("*")) if path.is_file())
-    if size > MOST_PARCEL:
-        raise InputError(f"{source} holds {size / GB:.1f} GB, and --upload sends at most {MOST_PARCEL / GB:.1f}; put it on shared storage")
-    return Parcel(pack(source), pack(folder) if folder.is_dir() else None)
+    if size > MOST_UPLOAD:
+        raise InputError(f"{source} holds {size / GB:.1f} GB, and --upload sends at most {MOST_UPLOAD / GB:.1f}; put it on shared storage")
+    return Upload(pack(source), pack(folder) if folder.is_dir() else None)
 
 
 def put_folder(data: bytes, folder: Path) -> None:

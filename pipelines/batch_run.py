@@ -32,7 +32,7 @@ ENDED = re.compile(r"^(?P<stage>[a-z_-]+): (?:reused|[\d.]+ s)$")
 
 
 @dataclass(frozen=True)
-class Parcel:
+class Upload:
     """Files that travel with a task, where workers do not share storage: the capture, and what an earlier run left.
 
     Attributes:
@@ -44,12 +44,12 @@ class Parcel:
 
 
 @dataclass(frozen=True)
-class Order:
+class RunSpec:
     """What a worker is to run.
 
     Attributes:
         words: options of `fieldfuse run`. log: file for all that the run writes. timeout: seconds; inf: none.
-        parcel: None where workers see `source` and `out`.
+        upload: None where workers see `source` and `out`.
     """
 
     source: str
@@ -57,38 +57,38 @@ class Order:
     words: tuple[str, ...]
     log: str
     timeout: float
-    parcel: Parcel | None = None
+    upload: Upload | None = None
 
 
-def carry_out(order: Order, link: Progress) -> dict[str, Any]:
+def execute(spec: RunSpec, link: Progress) -> dict[str, Any]:
     """Make the run.
 
     Returns:
-        `code` (of the process), `error` (a sentence or None), `seconds`, of a finished run `facts`; `folder`, if the order had a parcel: an
+        `code` (of the process), `error` (a sentence or None), `seconds`, of a finished run `facts`; `folder`, if the spec had an upload: an
         archive of what was made.
 
     Raises:
         OutputError: the log cannot be written.
     """
-    if order.parcel is None:
-        return _run(order, link)
+    if spec.upload is None:
+        return _run(spec, link)
     with tempfile.TemporaryDirectory(prefix="fieldfuse-") as scratch:
         place = Path(scratch)
-        source, out, log = place / "capture" / Path(order.source).name, place / "runs" / Path(order.out).name, place / "run.log"
-        unpack(order.parcel.source, source.parent)
-        if order.parcel.folder is not None:
-            unpack(order.parcel.folder, out.parent)
-        found = _run(replace(order, source=str(source), out=str(out), log=str(log)), link)
+        source, out, log = place / "capture" / Path(spec.source).name, place / "runs" / Path(spec.out).name, place / "run.log"
+        unpack(spec.upload.source, source.parent)
+        if spec.upload.folder is not None:
+            unpack(spec.upload.folder, out.parent)
+        found = _run(replace(spec, source=str(source), out=str(out), log=str(log)), link)
         return {**found, "folder": pack(out) if out.is_dir() else None}
 
 
-def _run(order: Order, link: Progress) -> dict[str, Any]:
-    log, began = Path(order.log), time.monotonic()
-    heard = Heard(log, link)
-    command = ["-c", RUN, "run", order.source, "--out", order.out, *order.words]
+def _run(spec: RunSpec, link: Progress) -> dict[str, Any]:
+    log, began = Path(spec.log), time.monotonic()
+    reader = LogReader(log, link)
+    command = ["-c", RUN, "run", spec.source, "--out", spec.out, *spec.words]
     try:
         log.parent.mkdir(parents=True, exist_ok=True)
-        code = child.run_logged(command, log, heard.listen, order.timeout, child.import_path(), link.stopping)
+        code = child.run_logged(command, log, reader.listen, spec.timeout, child.import_path(), link.stopping)
     except TimeoutError as error:
         return {"code": None, "error": f"{error}; give --timeout more, or a smaller --budget", "seconds": time.monotonic() - began}
     except OSError as error:
@@ -96,7 +96,7 @@ def _run(order: Order, link: Progress) -> dict[str, Any]:
     found: dict[str, Any] = {"code": code, "error": None, "seconds": round(time.monotonic() - began, 3)}
     if code == 0:
         try:
-            found["facts"] = facts(Path(order.out))
+            found["facts"] = facts(Path(spec.out))
             remove(log)
         except (FieldfuseError, LookupError, TypeError, AttributeError) as error:
             found["error"] = f"its report cannot be read ({first_line(error)})"
@@ -107,7 +107,7 @@ def _run(order: Order, link: Progress) -> dict[str, Any]:
     return found
 
 
-class Heard:
+class LogReader:
     """Reads what a run has written to its log since the last look, and passes on how far it is."""
 
     def __init__(self, log: Path, link: Progress) -> None:
@@ -126,12 +126,12 @@ class Heard:
         self._read += len(new)
         *lines, self._rest = (self._rest + new.decode(errors="replace")).split("\n")
         for line in reversed(lines):
-            if (found := understood(line)) is not None:
-                self._link.tell(found)  # type: ignore[attr-defined]
+            if (found := parse_progress(line)) is not None:
+                self._link.report(found)  # type: ignore[attr-defined]
                 return
 
 
-def understood(line: str) -> dict[str, Any] | None:
+def parse_progress(line: str) -> dict[str, Any] | None:
     """What a line of a run's progress says: `stage`, `share` (percent), `left`, `psnr`, each None where it says nothing of it."""
     if (ended := ENDED.match(line)) is not None:
         return {"stage": ended["stage"], "share": 100, "left": None, "psnr": None}

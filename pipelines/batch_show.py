@@ -19,7 +19,7 @@ AROUND = 6  # lines of the terminal that are not rows of the table
 Row = dict[str, Any]
 
 
-class Shown(ConsoleProgress):
+class Display(ConsoleProgress):
     """Silent, but it listens to Ctrl-C and passes it on; the base of the two that show something."""
 
     def __init__(self, rows: list[Row], stop: Callable[[], None], stream: IO[str] | None = None) -> None:
@@ -34,7 +34,7 @@ class Shown(ConsoleProgress):
         """A run was begun, or has ended."""
 
 
-class Lines(Shown):
+class Lines(Display):
     """A line whenever a run begins or ends."""
 
     def changed(self, row: Row) -> None:
@@ -45,7 +45,7 @@ class Lines(Shown):
         self.stream.flush()
 
 
-class LiveTable(Shown):
+class LiveTable(Display):
     """All runs, those at work first, as many as the terminal has lines for."""
 
     def __init__(self, rows: list[Row], stop: Callable[[], None], stream: IO[str] | None = None) -> None:
@@ -92,9 +92,9 @@ def line(row: Row) -> str:
     return f"{row['name']}: {row['state']}{': ' + row['error'] if row['error'] else ''}"
 
 
-def make_shown(rows: list[Row], stop: Callable[[], None], quiet: bool, stream: IO[str] | None = None) -> Shown:
+def make_display(rows: list[Row], stop: Callable[[], None], quiet: bool, stream: IO[str] | None = None) -> Display:
     """A table on a terminal, lines elsewhere, nothing with `quiet`."""
     stream = stream or sys.stderr
     if quiet:
-        return Shown(rows, stop, stream)
+        return Display(rows, stop, stream)
     return (LiveTable if stream.isatty() and os.environ.get("TERM") != "dumb" else Lines)(rows, stop, stream)

@@ -13,7 +13,7 @@ import numpy as np
 import torch
 
 from fieldfuse.capture.types import Views
-from fieldfuse.cluster import News, Task, Workers, open_workers
+from fieldfuse.cluster import Message, Task, Workers, open_workers
 from fieldfuse.errors import FieldfuseError, InputError, Interrupted
 from fieldfuse.files import fingerprint, read_json, remove, write_json
 from fieldfuse.nerfusion.decoder import Deferred
@@ -114,7 +114,7 @@ def _fit_missing(job: Job, folder: Path, plan: cells.ScenePlan, workers: Workers
         if job.progress.stopping():
             workers.stop()
 
-    def listen(news: News) -> None:
+    def listen(news: Message) -> None:
         if isinstance(news.data, dict) and "done" in news.data:
             shares[int(news.task.split()[1]) - 1] = news.data["done"] / max(news.data["total"], 1e-9)
         show()

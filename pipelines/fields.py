@@ -29,6 +29,7 @@ from fieldfuse.render.field import Field
 from fieldfuse.render.image import make_renderer, render_view
 from fieldfuse.stereo.transients import LeftOut, load_left_out, save_left_out
 from fieldfuse.tone import exposed
+from fieldfuse.training.cells.scene import cell_count
 from fieldfuse.training.finer_colours import finer_colours
 from fieldfuse.training.fit import Begin, FitResult
 from fieldfuse.training.from_network import Inference
@@ -220,9 +221,12 @@ def fit_radiance_field(job: Job, ready: Prepared, network: NetworkField | None, 
             return Fitted(direct_result(job, ready, network), [])
         first = None if network is None else network_start(network.field, views, scene, settings)
         begin = Begin(host, first, coarse=first is not None)
-        if settings.fit.cells != "off":
+        if cell_count(views, settings) > 1:
             return Fitted.of(fit_in_cells(job, views, scene, begin))
-        return Fitted.of(fit(views, settings=settings, begin=begin))
+        result = fit(views, settings=settings, begin=begin)
+        if settings.fit.cells == "auto":
+            result.notes.append("the scene is small enough to be fitted in one piece, so it was not cut into cells")
+        return Fitted.of(result)
 
     def save(value: Fitted) -> list[Path]:
         value.field.save(path, scene.working_from_input, {"budget": settings.fit.budget, "seed": settings.seed})

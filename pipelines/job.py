@@ -99,9 +99,11 @@ def _require_cells(settings: Settings) -> None:
     """Refuse what cells cannot do, if there are to be any.
 
     Raises:
-        InputError: another device, engine or decoder than that of a fit on the CPU.
+        InputError: another device, engine or decoder than that of a fit on the CPU; a cluster, and no cells.
     """
     if settings.fit.cells == "off":
+        if settings.address is not None:
+            raise InputError("--address is for a fit in cells; add --cells, or leave --address out")
         return
     if settings.device != "cpu" or settings.engine not in ("auto", "numba"):
         raise InputError("cells are fitted by the compiled engine of the CPU; add --device cpu, or leave --cells and --engine out")

@@ -372,8 +372,8 @@ class FitSettings:
     # of the finest lattice is one): what voxels cannot show is not asked of them. With few views, and 0: colours as they are
     soften: Share = 0.25
     prune_weight: Share = 0.05  # voxels whose largest seen weight stays below are removed
-    # A large scene as cells that are fitted one by one, or side by side on a cluster (docs/cluster.md): off, a number, or auto (by the size
-    # of the coarse field). The budget counts as if this machine's cores did all of it
+    # A large scene as cells that are fitted one by one, or side by side on a cluster (docs/cluster.md): off, a number, or auto (by the
+    # pixels of the images). The budget counts as if this machine's cores did all of it
     cells: Annotated[int | str, BeforeValidator(_check_cells)] = "off"
 
 

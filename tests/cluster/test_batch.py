@@ -18,8 +18,8 @@ from fieldfuse.cluster import has_ray
 from fieldfuse.errors import InputError
 from fieldfuse.files import read_json
 from fieldfuse.pipelines.batch_plan import plan
-from fieldfuse.pipelines.batch_run import understood
-from fieldfuse.pipelines.batch_show import make_shown
+from fieldfuse.pipelines.batch_run import parse_progress
+from fieldfuse.pipelines.batch_show import make_display
 from fieldfuse.pipelines.options import Options, words
 from tests.pipelines.made import call, command, environment, make_room, said
 from tests.pipelines.short import HUNG, wait_for
@@ -119,10 +119,10 @@ def test_a_dry_run_prices_and_starts_nothing(rooms: Path, tmp_path: Path, capsys
 
 def test_what_a_run_writes_is_understood() -> None:
     none = {"share": None, "left": None, "psnr": None}
-    assert understood("field 43%, 0:12 left, 32³, 24.3 dB") == {"stage": "field", "share": 43, "left": "0:12", "psnr": 24.3}
-    assert understood("poses 7%, matching") == {**none, "stage": "poses", "share": 7}
-    assert understood("views: 1.2 s") == understood("views: reused") == {**none, "stage": "views", "share": 100}
-    assert understood("fieldfuse: no such capture") is None and understood("a line of a library") is None
+    assert parse_progress("field 43%, 0:12 left, 32³, 24.3 dB") == {"stage": "field", "share": 43, "left": "0:12", "psnr": 24.3}
+    assert parse_progress("poses 7%, matching") == {**none, "stage": "poses", "share": 7}
+    assert parse_progress("views: 1.2 s") == parse_progress("views: reused") == {**none, "stage": "views", "share": 100}
+    assert parse_progress("fieldfuse: no such capture") is None and parse_progress("a line of a library") is None
 
 
 def test_the_table_of_a_terminal(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -131,14 +131,14 @@ def test_the_table_of_a_terminal(monkeypatch: pytest.MonkeyPatch) -> None:
     at_work = {"name": "[b]", "state": "running", "stage": "field", "share": 43, "left": "0:12", "psnr": 24.3, "node": "vm", "error": None}
     failed = {**at_work, **dict.fromkeys(("stage", "share", "left", "psnr")), "name": "a", "state": "failed", "error": "no such capture"}
     stream, stops = Terminal(), []
-    shown = make_shown([failed, at_work], lambda: stops.append(1), quiet=False, stream=stream)
+    shown = make_display([failed, at_work], lambda: stops.append(1), quiet=False, stream=stream)
     shown.request_stop()
     shown.say("stopping")
     shown.close()
     text = stream.getvalue()
     assert all(word in text for word in ("[b]", "field 43%", "0:12", "24.30", "no such capture", "1 running, 1 failed", "stopping"))
     assert text.rindex("[b]") < text.rindex("no such capture") and stops == [1] and shown.stopping()
-    assert type(make_shown([], lambda: None, quiet=True)).__name__ == "Shown"
+    assert type(make_display([], lambda: None, quiet=True)).__name__ == "Display"
 
 
 # ------------------------------------------------------------------------------------------------- runs

@@ -13,7 +13,7 @@ from typing import Any
 
 import pytest
 
-from fieldfuse.cluster import News, Node, Task, Workers, held, on_ray, open_workers
+from fieldfuse.cluster import Message, Node, Task, Workers, held, on_ray, open_workers
 from fieldfuse.errors import InputError
 from tests.cluster.functions import die_at_first, invert, wait_to_stop
 
@@ -115,7 +115,7 @@ def test_a_task_goes_on_where_a_node_was_added(cluster: Any, connected: Workers,
     large = Task("large", str(tmp_path / "begun"), memory=76 * 2**30, retries=1)  # only such a node has room for it
     places: list[str] = []
 
-    def change(news: News) -> None:
+    def change(news: Message) -> None:
         places.append(news.node)
         if len(there) == 1:
             cluster.remove_node(there[0], allow_graceful=False)

@@ -1,4 +1,4 @@
-"""`fieldfuse run --cells`: the same field whoever fits the cells, what is there is used again, and what is missing is said."""
+"""`fieldfuse run --cells`: the field does not depend on the workers, fitted cells are reused, errors name the cell."""
 
 from __future__ import annotations
 
@@ -96,6 +96,12 @@ def test_a_run_that_is_killed_goes_on_with_the_missing_cell(
     assert same(fitted, out)
 
 
+def test_a_small_scene_stays_in_one_piece(room: Path, tmp_path: Path) -> None:
+    answer = said("run", room, "--out", tmp_path / "out", *SMALL, "--cells", "auto", "--set", "export.formats=[]")
+    assert answer.code == 0 and "small enough to be fitted in one piece" in answer.out
+    assert not (tmp_path / "out" / "cells").exists()
+
+
 @pytest.mark.parametrize(
     ("options", "sentence"),
     [
@@ -105,6 +111,7 @@ def test_a_run_that_is_killed_goes_on_with_the_missing_cell(
         (["--cells", "3", "--decoder", "per_sample"], "deferred decoder"),
         (["--cells", "3", "--no-finetune"], "no-finetune"),
         (["--cells", "3", "--address", "nonsense"], "HOST:PORT"),
+        (["--address", "auto"], "add --cells"),
     ],
 )
 def test_what_cells_cannot_do_is_said_before_anything_is_fitted(options: list[str], sentence: str, room: Path, tmp_path: Path) -> None:

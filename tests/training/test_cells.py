@@ -140,5 +140,5 @@ def test_a_cell_that_came_back_empty_is_refused() -> None:
     fields = [replace(surrounded(coarse, cells, cell, 2), outer=None).settled() for cell in range(3)]
     empty = replace(fields[1], occupied=torch.zeros_like(fields[1].occupied))
     result = merged(coarse, cells, {0: fields[0], 1: empty, 2: fields[2]})
-    with pytest.raises(NotCoveredError, match="cell 1 of 3 holds nothing"):
+    with pytest.raises(NotCoveredError, match="cell 2 of 3 came back with 0%"):
         check_coverage(coarse, coarse.occupied.view(-1, 512).sum(1).numpy(), cells, result)

@@ -1,6 +1,6 @@
 """Functions as tasks on the machines of a Ray cluster, on a pool of Ray's on this one, or in this process: one interface for the three.
 
-    def square(number, link):                   # link: a Progress, through which a task is heard and stopped
+    def square(number, link):                   # link: a Progress, through which a task is reader and stopped
         link.update(1, 1, "squared")
         return number**2
 
@@ -23,10 +23,10 @@ from typing import Any
 
 from fieldfuse.cluster.checks import require_answer
 from fieldfuse.cluster.on_ray import Cluster
-from fieldfuse.cluster.tasks import RETRIES, Here, Link, Listener, News, Node, Outcome, Task, Workers, held
+from fieldfuse.cluster.tasks import RETRIES, Here, Link, Listener, Message, Node, Outcome, Task, Workers, held
 from fieldfuse.extras import extra
 
-__all__ = ["RETRIES", "Link", "Listener", "News", "Node", "Outcome", "Task", "Workers", "has_ray", "held", "open_workers"]
+__all__ = ["RETRIES", "Link", "Listener", "Message", "Node", "Outcome", "Task", "Workers", "has_ray", "held", "open_workers"]
 STORE = 256 * 2**20  # bytes of Ray's object store on a pool of this machine: tasks pass paths
 
 

@@ -10,7 +10,7 @@ from typing import Any
 
 from fieldfuse import __version__
 from fieldfuse.cluster.checks import examiner, probe, require
-from fieldfuse.cluster.tasks import Function, Link, Listener, News, Node, Outcome, Task, Workers, call
+from fieldfuse.cluster.tasks import Function, Link, Listener, Message, Node, Outcome, Task, Workers, call
 from fieldfuse.errors import InputError, first_line
 
 EXAMINE = 120.0  # seconds in which each node must have looked at its versions and storage: its first worker imports this package
@@ -24,7 +24,7 @@ class _Board:
         self.news: list[tuple[str, str, Any]] = []
         self.stop = False
 
-    def tell(self, task: str, node: str, data: Any) -> bool:
+    def report(self, task: str, node: str, data: Any) -> bool:
         if data is not None:
             self.news.append((task, node, data))
         return self.stop
@@ -43,7 +43,7 @@ def _on_node(function: Function, name: str, argument: Any, board: Any) -> Outcom
 
     def send(data: Any) -> bool:
         # Not `ray.get`: while a task waits in it, Ray gives its cores to another.
-        return bool(board.tell.remote(name, node, data).future().result())
+        return bool(board.report.remote(name, node, data).future().result())
 
     if send(None):
         return Outcome(begun=False, node=node)
@@ -65,7 +65,7 @@ class Cluster(Workers):
         out = []
         for one in found:
             host, key, has = one["NodeManagerHostname"], one["NodeID"], one["Resources"]
-            # Nodes of one host, as tests and some clusters have them, are told apart by Ray's id.
+            # Nodes of one host, as tests and some clusters have them, get a part of Ray's id.
             self._names.setdefault(key, f"{host}-{key[:6]}" if hosts.count(host) > 1 else host)
             out.append(Node(self._names[key], key, has.get("CPU", 0.0), has.get("GPU", 0.0), int(has.get("memory", 0))))
         return out
@@ -103,7 +103,7 @@ class Cluster(Workers):
         from ray.util.scheduling_strategies import NodeAffinitySchedulingStrategy
 
         here = NodeAffinitySchedulingStrategy(self.ray.get_runtime_context().get_node_id(), soft=False)
-        lasting = {"max_restarts": -1, "max_task_retries": -1}  # whatever is killed, tasks can be heard
+        lasting = {"max_restarts": -1, "max_task_retries": -1}  # whatever is killed, tasks can be reader
         board = self.ray.remote(_Board).options(num_cpus=0, scheduling_strategy=here, **lasting).remote()
         remote = self.ray.remote(_on_node)
         left = {}
@@ -117,7 +117,7 @@ class Cluster(Workers):
             for name, node, data in self.ray.get(board.take.remote(self.stopped)):
                 places[name] = self._name(node)
                 if listen is not None:
-                    listen(News(name, places[name], data))
+                    listen(Message(name, places[name], data))
 
         while left:
             ended, _ = self.ray.wait(list(left), num_returns=1, timeout=TICK)

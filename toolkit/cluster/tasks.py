@@ -72,7 +72,7 @@ class Outcome:
 
 
 @dataclass(frozen=True)
-class News:
+class Message:
     """What a running task said."""
 
     task: str
@@ -81,7 +81,7 @@ class News:
 
 
 Function = Callable[[Any, "Link"], Any]
-Listener = Callable[[News], None]
+Listener = Callable[[Message], None]
 
 
 class Link(Progress):
@@ -90,19 +90,19 @@ class Link(Progress):
     def __init__(self, send: Callable[[Any], bool]) -> None:
         self._send, self._stop, self._asked = send, False, -LISTEN
 
-    def tell(self, data: Any) -> None:
+    def report(self, data: Any) -> None:
         """Plain data to the listener of `Workers.run`."""
         self._stop = self._send(data) or self._stop
         self._asked = time.monotonic()
 
     def update(self, done: float, total: float, note: str = "") -> None:
         if time.monotonic() - self._asked >= LISTEN or done >= total:
-            self.tell({"done": done, "total": total, "note": note})
+            self.report({"done": done, "total": total, "note": note})
 
     def stopping(self) -> bool:
         """Whether the task is to end what it is at and return."""
         if not self._stop and time.monotonic() - self._asked >= LISTEN:
-            self.tell(None)
+            self.report(None)
         return self._stop
 
 
@@ -184,7 +184,7 @@ class Here(Workers):
 
             def send(data: Any, name: str = task.name) -> bool:
                 if listen is not None and data is not None:
-                    listen(News(name, self._node.name, data))
+                    listen(Message(name, self._node.name, data))
                 return self.stopped
 
             send({"begun": True})

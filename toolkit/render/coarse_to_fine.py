@@ -16,7 +16,7 @@ from fieldfuse.render.sky import on_sky
 SMOOTH = 8 / 255  # between pixels whose colours differ by less, the mean will do …
 SAME_SURFACE = 0.02  # … and by this share of the depth (as `export.surface` takes no smaller step for an edge) …
 AS_OPAQUE = 0.1  # … and of opacity
-CAREFUL = 0.5  # of these between pixels that are farther apart than two: more may lie between
+CAREFUL = 0.3  # of these between pixels that are farther apart than two: more may lie between
 NOWHERE = 1e-9  # depth of what has none, for its logarithm
 
 

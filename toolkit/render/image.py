@@ -43,6 +43,8 @@ def make_renderer(field: Field, engine: str = "auto", threads: int | None = None
         engine: auto | numba | triton | torch. Numba runs on the CPU alone, Triton on CUDA alone.
         threads: of Numba; None: as many as torch has.
     """
+    if field.outer is not None:
+        raise ValueError("a cell's field is rendered by the engine that fits it; merge the cells first")
     chosen = choose_engine(engine, "deferred" if isinstance(field.decoder, Deferred) else "per_sample", field.device)
     if chosen == "triton":
         from fieldfuse.render.triton_renderer import TritonRenderer

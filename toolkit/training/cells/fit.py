@@ -29,25 +29,25 @@ class CellPlan:
     """What the fit of a cell needs to know of the whole.
 
     Attributes:
+        cell: which one.
         rays_before: that the coarse field was fitted with.
         share: of the scene's pixels that are the cell's: with so much fewer rays it comes as far.
-        seconds, steps: of the whole fit, whichever are spent first; None: the other.
+        seconds, steps: of the cell's fit, whichever are spent first; `steps` None: seconds alone.
         slow_within: see `Schedule`.
         trust: see `Schedule`.
         opaque: every ray ends somewhere (captures without alpha).
         seed: of the cell's random numbers.
-        threads: that fit it. The result is the same bit for bit for the same number of steps and threads.
     """
 
+    cell: int
     rays_before: int
     share: float
-    seconds: float | None
+    seconds: float
     steps: int | None
     slow_within: float
     trust: Trust
     opaque: bool
     seed: int
-    threads: int = 1
 
 
 @dataclass(frozen=True)
@@ -64,22 +64,23 @@ class FittedCell:
 def fit_cell(
     coarse: Field,
     cells: Cells,
-    cell: int,
     pool: PixelPool,
     settings: Settings,
     plan: CellPlan,
     progress: Progress = SILENT,
     ticks: Callable[[], float] = time.perf_counter,
 ) -> FittedCell:
-    """Refine what cell `cell` owns, and a halo around that, on the pixels of `pool`."""
+    """Refine what a cell owns, and a halo around that, on the pixels of `pool`.
+
+    One thread does it, so equal steps give the same bits wherever the cell is fitted.
+    """
     begin, finest = ticks(), COARSER * coarse.resolution
-    region = region_mask(coarse, cells, cell, coarse.resolution, finest)
+    region = region_mask(coarse, cells, plan.cell, coarse.resolution, finest)
     rest = replace(coarse, occupied=coarse.occupied & ~region)  # whose place the region takes
     current = replace(finer(coarse, region, finest, TorchHost()), outer=rest)
-    engine = NumbaEngine(current, pool, plan.seed, plan.threads)
-    budget = plan.seconds or 1e9
+    engine = NumbaEngine(current, pool, plan.seed, threads=1)
     fit = replace(settings.fit, iterations=plan.steps)
-    schedule = Schedule([finest], budget, fit, plan.opaque, slow_within=plan.slow_within, trust=plan.trust)
+    schedule = Schedule([finest], plan.seconds, fit, plan.opaque, slow_within=plan.slow_within, trust=plan.trust)
     policy = NonfinitePolicy()
     rays = steps = 0
     batch = max(LEAST_BATCH, round(settings.fit.max_rays * plan.share))
@@ -100,7 +101,7 @@ def fit_cell(
         steps += 1
         rays += batch
         if steps % 20 == 0:
-            progress.update(done, 1, f"cell {cell + 1} of {cells.count}, {schedule.resolution}³")
+            progress.update(done, 1, f"{schedule.resolution}³")
     field = replace(current, outer=None).settled()
     return FittedCell(field, ticks() - begin, steps, rays, progress.stopping())
 

@@ -59,7 +59,7 @@ def check_coverage(coarse: Field, seen: Array, cells: Cells, result: Field) -> l
         a sentence where single blocks were found empty by their cell.
 
     Raises:
-        NotCoveredError: a cell that rays saw holds nothing.
+        NotCoveredError: a cell has lost half of what rays saw in it, or more.
     """
     ratio = result.resolution // coarse.resolution
     filled = result.topology.keys[result.occupied.view(-1, VOXELS).any(1)]
@@ -67,13 +67,13 @@ def check_coverage(coarse: Field, seen: Array, cells: Cells, result: Field) -> l
     there = np.zeros(coarse.blocks, bool)
     there[slots[slots >= 0]] = True
     for cell in range(cells.count):
-        own = (cells.owner == cell) & (seen > 0)
-        if own.any() and not there[own].any():
-            raise NotCoveredError(
-                f"cell {cell} of {cells.count} holds nothing, though training rays end in {own.sum()} of its blocks; please report this"
-            )
+        own = cells.owner == cell
+        kept, all_of_it = int(seen[own & there].sum()), int(seen[own].sum())
+        if 2 * kept <= all_of_it and all_of_it:
+            share = f"{kept / all_of_it:.0%} of what training rays see in it"
+            raise NotCoveredError(f"cell {cell + 1} of {cells.count} came back with {share}; please report this")
     lost = (seen > 0) & ~there
     if not lost.any():
         return []
-    share = seen[lost].sum() / seen.sum()
-    return [f"cells: {lost.sum()} of {(seen > 0).sum()} blocks that the coarse field has ({share:.1%} of the rays) were found to be empty"]
+    rays = f"{seen[lost].sum() / seen.sum():.1%} of the rays"
+    return [f"cells: {lost.sum()} of {(seen > 0).sum()} blocks that the coarse field has ({rays}) were found to be empty"]

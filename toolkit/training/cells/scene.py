@@ -48,7 +48,7 @@ from fieldfuse.volume.edit import dilate
 
 COARSE_SHARE = 0.55  # of the seconds or steps of the whole fit: one in one piece comes to its finest lattice as late
 LEAST_RESOLUTION = 32  # of a coarse field
-VOXELS_A_CELL = 400_000  # that cells have on the finest lattice, where their number is left to us
+PIXELS_A_CELL = 8_000_000  # of training images, where the number of cells is chosen (`auto`)
 COARSE, CELLS, PLAN = "coarse.safetensors", "cells.safetensors", "plan.json"
 
 
@@ -97,18 +97,21 @@ def coarse_settings(settings: Settings, resolution: int) -> Settings:
     return replace(settings, field=replace(settings.field, resolution=resolution), fit=replace(fit, budget=seconds, iterations=steps))
 
 
-def cells_wanted(coarse: Field) -> int:
-    """How many cells a scene is worth: by the voxels that the finest lattice will have, so 1 where that is a field like any other.
+def cell_count(views: Views, settings: Settings) -> int:
+    """Into how many cells a scene is to be cut; 1: it is fitted in one piece.
 
-    Surfaces have four times as many voxels on a lattice twice as fine.
+    `auto` goes by the pixels of the training images, which are known before anything is fitted, and not by who will fit the cells.
     """
-    return max(1, round(coarse.voxels * COARSER**2 / VOXELS_A_CELL))
+    if settings.fit.cells != "auto":
+        return int(settings.fit.cells) if settings.fit.cells != "off" else 1
+    pixels = sum(lens.width * lens.height for lens, test in zip(views.intrinsics, views.test, strict=True) if not test)
+    return max(1, round(pixels / PIXELS_A_CELL))
 
 
 def write_scene(
     folder: Path, key: str, result: FitResult, views: Views, scene: Scene, settings: Settings, progress: Progress = SILENT
 ) -> ScenePlan:
-    """Cut a scene by its coarse field into `fit.cells`; `auto`: `cells_wanted`.
+    """Cut a scene by its coarse field into `cell_count` cells.
 
     Args:
         result: of the coarse fit.
@@ -121,16 +124,16 @@ def write_scene(
     shown = views if result.left_out is None else result.left_out.without(views)
     train = shown.subset(np.flatnonzero(~shown.test))
     coarse = result.field
-    seen = seen_weights(coarse, train.intrinsics, train.world_from_camera, progress) > settings.fit.prune_weight
+    least = settings.fit.prune_weight
+    seen = seen_weights(coarse, train.intrinsics, train.world_from_camera, progress, least) > least
     coarse = pruned(coarse, dilate(coarse.topology, seen, 1, grow=False)[1]).settled()
     sight = Sight(coarse, settings.threads)
     rays = sight.rays_of_blocks(train)
     if not rays.any():
         raise InputError("training rays see nothing of the coarse field, so it cannot be cut into cells; give it more --budget")
     voxels = coarse.occupied.view(-1, BLOCK**3).sum(1).numpy()
-    count = settings.fit.cells if isinstance(settings.fit.cells, int) else cells_wanted(coarse)
     # Seconds go by rays, memory by voxels: cells are to be alike in both.
-    cells = cut(coarse.topology.keys.numpy(), np.sqrt(rays * voxels.astype(np.float64)), count)
+    cells = cut(coarse.topology.keys.numpy(), np.sqrt(rays * voxels.astype(np.float64)), cell_count(views, settings))
     coarse.save(folder / COARSE, scene.working_from_input)
     owners = {"keys": cells.keys, "owner": cells.owner, "rays": rays}
     write_tensors(folder / CELLS, {name: torch.from_numpy(np.ascontiguousarray(values)) for name, values in owners.items()})
@@ -242,6 +245,7 @@ def fit_cell_of(argument: tuple[str, int], progress: Progress, ticks: Callable[[
         pool = PixelPool.of([file.get_tensor(name) for name in names], int(file.metadata()["height"]))
     warm_up(replace(settings, device="cpu"), progress)
     of_cell = CellPlan(
+        cell=cell,
         rays_before=plan.rays_before,
         share=plan.shares[cell],
         seconds=plan.seconds[cell],
@@ -251,7 +255,7 @@ def fit_cell_of(argument: tuple[str, int], progress: Progress, ticks: Callable[[
         opaque=plan.opaque,
         seed=settings.seed + cell,
     )
-    done: FittedCell = fit_cell(coarse, cells, cell, pool, settings, of_cell, progress, ticks)
+    done: FittedCell = fit_cell(coarse, cells, pool, settings, of_cell, progress, ticks)
     if done.interrupted:
         raise Interrupted
     path = cell_path(folder, cell)
