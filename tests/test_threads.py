@@ -4,12 +4,14 @@ from __future__ import annotations
 
 import threading
 import time
+from collections.abc import Iterator
+from contextlib import closing
 
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from fieldfuse.threads import share, slices
+from fieldfuse.threads import ahead, share, slices
 
 
 @settings(max_examples=30, deadline=None)
@@ -84,3 +86,23 @@ def test_slices_are_all_of_it_and_about_equal(length: int, pieces: int) -> None:
     assert [index for part in parts for index in range(length)[part]] == list(range(length))
     sizes = [part.stop - part.start for part in parts]
     assert not sizes or (min(sizes) > 0 and max(sizes) - min(sizes) <= 1)
+
+
+def test_items_are_made_ahead_in_order_and_errors_reach_the_caller() -> None:
+    made: list[int] = []
+
+    def items(fail: int) -> Iterator[int | None]:
+        for item in range(5):
+            if item == fail:
+                raise ValueError("spoilt")
+            made.append(item)
+            yield item if item != 2 else None
+
+    assert list(ahead(items(9))) == [0, 1, None, 3, 4]
+    assert list(ahead([])) == []
+    with closing(ahead(items(9))) as few:
+        made.clear()
+        assert next(few) == 0
+    assert made in ([0], [0, 1])  # no more than one ahead
+    with pytest.raises(ValueError, match="spoilt"):
+        list(ahead(items(3)))

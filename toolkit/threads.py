@@ -11,7 +11,7 @@ from collections import deque
 from collections.abc import Callable, Generator, Iterable, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
 from itertools import count, pairwise
-from typing import TypeVar
+from typing import TypeVar, cast
 
 T = TypeVar("T")
 R = TypeVar("R")
@@ -67,6 +67,16 @@ def in_order(work: Callable[[T], R], pieces: Iterable[T], threads: int) -> Gener
                 yield begun.popleft().result()
         finally:
             pool.shutdown(cancel_futures=True)
+
+
+def ahead(items: Iterable[T]) -> Generator[T, None, None]:
+    """The items, each made on another thread while the one before it is used. That thread ends with the iterator: close it."""
+    made, end = iter(items), object()
+    with ThreadPoolExecutor(1) as pool:
+        coming = pool.submit(next, made, end)
+        while (item := coming.result()) is not end:
+            coming = pool.submit(next, made, end)
+            yield cast(T, item)
 
 
 def slices(length: int, pieces: int) -> list[slice]:

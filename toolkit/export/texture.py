@@ -9,6 +9,7 @@ what is smaller is the best images' own.
 from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
+from contextlib import closing
 from dataclasses import dataclass
 from typing import Any
 
@@ -20,6 +21,7 @@ from fieldfuse.backends.numba.texels import add_image, finish, shift
 from fieldfuse.camera import Array, Intrinsics, invert
 from fieldfuse.export.atlas import Atlas, make_atlas
 from fieldfuse.progress import SILENT, Progress
+from fieldfuse.threads import ahead
 from fieldfuse.tsdf.mesh import Mesh
 
 LARGEST = 4096  # texels along a texture
@@ -76,12 +78,13 @@ def textured(mesh: Mesh, photos: Photos, largest: int = LARGEST, progress: Progr
     corners = mesh.vertices[mesh.triangles].astype(np.float32)
     layout = (atlas.corner, atlas.length, atlas.way)
     count = len(photos.intrinsics)
-    for index, (image, camera, pose) in enumerate(zip(photos.images, photos.intrinsics, photos.world_from_camera, strict=True)):
-        progress.check()
-        share = np.where(which == index, best, 0).sum(axis=1).astype(np.float32)[mesh.triangles]  # (T, 3)
-        matrix = (camera.matrix() @ invert(pose)[:3]).astype(np.float32)
-        add_image(np.flatnonzero(share.any(axis=1)), corners, share, *layout, np.ascontiguousarray(image), matrix, texture, total)
-        progress.update(count + index + 1, 2 * count, "texture")
+    with closing(ahead(photos.images)) as images:
+        for index, (image, camera, pose) in enumerate(zip(images, photos.intrinsics, photos.world_from_camera, strict=True)):
+            progress.check()
+            share = np.where(which == index, best, 0).sum(axis=1).astype(np.float32)[mesh.triangles]  # (T, 3)
+            matrix = (camera.matrix() @ invert(pose)[:3]).astype(np.float32)
+            add_image(np.flatnonzero(share.any(axis=1)), corners, share, *layout, np.ascontiguousarray(image), matrix, texture, total)
+            progress.update(count + index + 1, 2 * count, "texture")
     means = np.zeros((len(corners), 3), np.float32)
     finish(corners, mesh.colours[mesh.triangles].astype(np.float32), *layout, texture, total, means)
     shift(_level(mesh, means)[mesh.triangles], *layout, texture)
