@@ -17,6 +17,7 @@ from hypothesis import strategies as st
 
 from fieldfuse import memory
 from fieldfuse.errors import InputError
+from tests.pages import mapped
 
 ROOT = Path(__file__).resolve().parents[1]
 
@@ -95,6 +96,23 @@ def test_pages_that_nobody_writes_take_no_memory() -> None:
     assert not values[1 : 2**20].any() and len(memory.pages(0)) == 0
     worst = memory.unwritten((3, 5), np.float32)
     assert worst.shape == (3, 5) and worst.dtype == np.float32 and not worst.any() and worst.flags.writeable
+
+
+def test_pages_that_do_not_fit_into_memory_are_a_file_without_a_name(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    assert not mapped(tmp_path)
+    monkeypatch.setattr(memory, "available", lambda: memory.SPARE + 2**23)
+    fits, buffer = memory.pages(2**22, tmp_path), memory.pages(2**23, tmp_path)
+    assert mapped(tmp_path) == [2**23] and not list(tmp_path.iterdir())
+    values = np.frombuffer(buffer, np.uint8)
+    assert not values.any() and values.flags.writeable
+    values[5] = 1
+    assert len(memory.pages(2**30)) == 2**30  # without a folder it is memory
+    del values, buffer, fits
+    assert not mapped(tmp_path)
+    with pytest.raises(InputError, match=r"needs about \d+\.0 GB of memory or disk, and 0\.1 GB of memory and .* on the disk of"):
+        memory.pages(2**55, tmp_path)
+    with pytest.raises(InputError, match=r"which cannot be made .*copy the field to a folder that can be written"):
+        memory.pages(2**23, tmp_path / "nowhere")
 
 
 def resident() -> int:

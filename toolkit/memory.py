@@ -7,7 +7,9 @@ import math
 import mmap
 import os
 import resource
+import shutil
 import sys
+import tempfile
 from collections.abc import Sequence
 from contextlib import suppress
 from pathlib import Path
@@ -26,6 +28,7 @@ if TYPE_CHECKING:
 
 GIB = 2**30
 SPARE = 128 * 2**20  # left to everything else
+IN_MEMORY = 0.5  # of the memory that can still be had is the most that one array of a field takes of it; larger ones go into files
 _CGROUP = Path("/sys/fs/cgroup")
 # Of control groups, second and first version: what is allowed, what is in use, and which part of it are files nobody looked at lately.
 _GROUPS = (
@@ -143,16 +146,52 @@ def workers(wanted: int, each: int, what: str, advice: str) -> int:
     return max(1, min(wanted, (available() - SPARE) // max(1, each)))
 
 
-def pages(size: int) -> mmap.mmap | bytearray:
+def pages(size: int, folder: Path | None = None) -> mmap.mmap | bytearray:
     """`size` bytes, all zero, for what will be written here and there: where nothing is written they take no memory, page by page. (What
-    NumPy gives begins so, too, but on systems with huge pages a byte that is written takes 2 MB.)"""
+    NumPy gives begins so, too, but on systems with huge pages a byte that is written takes 2 MB.)
+
+    Args:
+        folder: where these bytes become a file, if they are more than `IN_MEMORY` of what can still be had: the system keeps in memory what
+            is in use. The file has no name and goes with the last reference.
+
+    Raises:
+        InputError: they are that many, and the folder's disk has no room for them.
+    """
     if size == 0 or not hasattr(mmap, "MAP_PRIVATE"):
         return bytearray(size)
+    if folder is not None and size > IN_MEMORY * (available() - SPARE):
+        return _file_pages(size, folder)
     out = mmap.mmap(-1, size, flags=mmap.MAP_PRIVATE | mmap.MAP_ANONYMOUS)
     if hasattr(mmap, "MADV_NOHUGEPAGE"):
         with suppress(OSError):  # a kernel without huge pages
             out.madvise(mmap.MADV_NOHUGEPAGE)
     return out
+
+
+def _file_pages(size: int, folder: Path) -> mmap.mmap:
+    try:
+        require_place(size, folder, "a field that does not fit into memory")
+        with tempfile.TemporaryFile(dir=folder) as file:
+            file.truncate(size)
+            return mmap.mmap(file.fileno(), size)
+    except OSError as error:
+        reason = f"a field that does not fit into memory needs a file of {size / GIB:.1f} GB in {folder}"
+        raise InputError(f"{reason}, which cannot be made ({error.strerror}); copy the field to a folder that can be written") from error
+
+
+def require_place(size: int, folder: Path, what: str) -> None:
+    """Refuse what would need `size` bytes, in memory or else on the disk of `folder`, when there are fewer.
+
+    Args:
+        what: what needs them, the start of a sentence.
+
+    Raises:
+        InputError: naming both numbers.
+    """
+    there, free = available(), shutil.disk_usage(folder).free
+    if size > max(there, free) - SPARE:
+        left = f"{there / GIB:.1f} GB of memory and {free / GIB:.1f} GB on the disk of {folder} are free"
+        raise InputError(f"{what} needs about {size / GIB:.1f} GB of memory or disk, and {left}; free some, or use another machine")
 
 
 def unwritten(shape: tuple[int, ...], dtype: Any) -> NDArray[Any]:

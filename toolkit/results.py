@@ -359,7 +359,7 @@ class Field(Renderable):
         exposure = data.meta.get("exposure", 1.0 if scene is None else scene.views.exposure)
         if not isinstance(exposure, int | float) or not 0 < exposure < np.inf:
             raise InputError(f"{path} is damaged (its exposure is {exposure!s:.40}); fit it again")
-        sparse = SparseField.from_file(data, str(path)).to(steps.choose_device(device))
+        sparse = SparseField.from_file(data, Path(path)).to(steps.choose_device(device))
         return cls(sparse, data.working_from_input, float(exposure), scene)
 
 

@@ -2,17 +2,20 @@
 
 from __future__ import annotations
 
+import mmap
 from pathlib import Path
 
 import numpy as np
 import pytest
 import torch
 
+from fieldfuse import memory
 from fieldfuse.camera import Intrinsics, Similarity
 from fieldfuse.errors import InputError
 from fieldfuse.render.field import Field, density
-from fieldfuse.render.image import render_view
+from fieldfuse.render.image import make_renderer, render_view
 from fieldfuse.render.rays import render_rays
+from tests.pages import mapped
 from tests.render.made import random_field, random_rays
 
 
@@ -27,6 +30,24 @@ def test_a_saved_field_renders_the_same(tmp_path: Path, decoder: str) -> None:
     assert torch.allclose(before.colour, after.colour, atol=5e-3)  # features are stored as float16
     assert torch.allclose(before.opacity, after.opacity, atol=1e-5)
     assert again.voxels == field.voxels and again.voxel_size == pytest.approx(field.voxel_size)
+
+
+def test_a_field_larger_than_memory_is_read_rendered_and_written_from_files(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    (source := tmp_path / "source").mkdir()
+    random_field(keep=0.3).save(source / "field.safetensors")
+    usual, (origins, directions) = Field.load(source / "field.safetensors"), random_rays(200)
+    monkeypatch.setattr(memory, "available", lambda: memory.SPARE + 2**17)
+    large = Field.load(source / "field.safetensors")
+    assert sorted(mapped(source), reverse=True)[:2] == [-(-rows.nbytes // mmap.PAGESIZE) * mmap.PAGESIZE for rows in rows_of(large)]
+    assert all(torch.equal(one, two) for one, two in zip(rows_of(usual), rows_of(large), strict=True))
+    assert torch.equal(make_renderer(usual)(origins, directions).colour, make_renderer(large)(origins, directions).colour)
+    large.settled(tmp_path).save(tmp_path / "field.safetensors")
+    assert (tmp_path / "field.safetensors").read_bytes() == (source / "field.safetensors").read_bytes()
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["field.safetensors", "source"]
+
+
+def rows_of(field: Field) -> tuple[torch.Tensor, torch.Tensor]:
+    return field.feature_rows, field.density_rows
 
 
 def test_settling_changes_nothing_that_is_seen() -> None:

@@ -125,7 +125,7 @@ def test_unchanged_cells_merge_to_the_whole(ratio: int) -> None:
     coarse = random_field(1.0, 32, keep=0.2)
     cells, whole = cells_of(coarse, 6), whole_refined(coarse, ratio).settled()
     fields = [replace(surrounded(coarse, cells, cell, ratio), outer=None).settled() for cell in range(cells.count)]
-    result = merged(coarse, cells, dict(enumerate(fields)))
+    result = merged(coarse, cells, fields.__getitem__)
     slots = result.topology.find(whole.topology.keys)
     assert result.blocks == whole.blocks and bool((slots >= 0).all())
     assert torch.equal(result.occupied.view(-1, 512)[slots], whole.occupied.view(-1, 512))
@@ -139,6 +139,6 @@ def test_a_cell_that_came_back_empty_is_refused() -> None:
     cells = cells_of(coarse, 3)
     fields = [replace(surrounded(coarse, cells, cell, 2), outer=None).settled() for cell in range(3)]
     empty = replace(fields[1], occupied=torch.zeros_like(fields[1].occupied))
-    result = merged(coarse, cells, {0: fields[0], 1: empty, 2: fields[2]})
+    result = merged(coarse, cells, [fields[0], empty, fields[2]].__getitem__)
     with pytest.raises(NotCoveredError, match="cell 2 of 3 came back with 0%"):
         check_coverage(coarse, coarse.occupied.view(-1, 512).sum(1).numpy(), cells, result)

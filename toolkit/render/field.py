@@ -100,22 +100,28 @@ class Field:
             background=self.background.to(device),
         )
 
-    def settled(self) -> Field:
-        """A copy in memory of its own, without the blocks that hold nothing."""
-        return self.packed()()
+    def settled(self, folder: Path | None = None) -> Field:
+        """A copy in memory of its own, without the blocks that hold nothing. `folder`: see `packed`."""
+        return self.packed(folder)()
 
-    def packed(self) -> Callable[[], Field]:
+    def packed(self, folder: Path | None = None) -> Callable[[], Field]:
         """What makes the copy that `settled` is; it holds the corners that voxels use and nothing else, so that the memory of this field's
-        rows can be freed before the copy's is taken: the end of a fit is when most is needed."""
+        rows can be freed before the copy's is taken: the end of a fit is when most is needed.
+
+        Args:
+            folder: for what there is not enough memory for (`memory.pages`).
+        """
         corners = corner_nodes(self.topology, self.occupied).view(-1, VOXELS)
         kept = corners.any(1).nonzero().view(-1)
         source = corners.view(-1).nonzero().view(-1)
-        density, feature = self.density_rows.detach()[source], self.feature_rows.detach()[source]
+        density, feature = (compact(rows, source, folder=folder) for rows in (self.density_rows, self.feature_rows))
         index, blocks = corners[kept].view(-1).nonzero().view(-1), len(kept)
         occupied = self.occupied.view(-1, VOXELS)[kept].view(-1)
         topology, none = Topology(self.topology.keys[kept]), (density[:0], feature[:0])
         rest = replace(self, topology=topology, occupied=occupied, density_rows=none[0], feature_rows=none[1])
-        return lambda: replace(rest, density_rows=expand(density, index, blocks), feature_rows=expand(feature, index, blocks))
+        return lambda: replace(
+            rest, density_rows=expand(density, index, blocks, folder), feature_rows=expand(feature, index, blocks, folder)
+        )
 
     def save(self, path: Path | str, working_from_input: Similarity | None = None, meta: dict[str, Any] | None = None) -> None:
         """Write `field.safetensors`, atomically; corners that no occupied voxel uses are left out.
@@ -140,8 +146,8 @@ class Field:
             keys=self.topology.keys,
             occupied=self.occupied.view(-1, VOXELS),
             node_index=nodes.int(),
-            features=compact(self.feature_rows, nodes, torch.float16),
-            density=compact(self.density_rows, nodes),
+            features=compact(self.feature_rows, nodes, torch.float16, Path(path).parent),
+            density=compact(self.density_rows, nodes, folder=Path(path).parent),
             decoder=dict(self.decoder.state_dict()),
             config=config,
             voxel_size=self.voxel_size,
@@ -153,16 +159,16 @@ class Field:
 
     @classmethod
     def load(cls, path: Path | str) -> Field:
-        """Read `field.safetensors`.
+        """Read `field.safetensors`. What is too large for the memory is unpacked into files without a name beside it (`memory.pages`).
 
         Raises:
-            InputError: the file is not a field, or was tampered with.
+            InputError: the file is not a field, or was tampered with, or there is too little memory and disk for it.
         """
-        return cls.from_file(read_field(path), str(path))
+        return cls.from_file(read_field(path), Path(path))
 
     @classmethod
-    def from_file(cls, data: FieldFile, where: str) -> Field:
-        """A field from the contents of a file that came from `where`."""
+    def from_file(cls, data: FieldFile, path: Path) -> Field:
+        """A field from the contents of the file `path`; see `load`."""
         try:
             config = data.config
             space, resolution = Space.from_dict(config["space"]), int(config["resolution"])
@@ -178,15 +184,15 @@ class Field:
             decoder.load_state_dict(data.decoder)
         except (KeyError, TypeError, ValueError, RuntimeError, OverflowError) as error:
             reason = first_line(error)
-            raise InputError(f"{where} does not hold a field that can be used ({reason}); fit it again") from error
+            raise InputError(f"{path} does not hold a field that can be used ({reason}); fit it again") from error
         blocks = len(data.keys)
         return cls(
             space,
             resolution,
             Topology(data.keys),
             data.occupied.reshape(-1),
-            expand(data.density, data.node_index, blocks),
-            expand(data.features, data.node_index, blocks),
+            expand(data.density, data.node_index, blocks, path.parent),
+            expand(data.features, data.node_index, blocks, path.parent),
             decoder,
             background,
             near,

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Protocol
 
 import torch
@@ -17,12 +18,15 @@ from fieldfuse.volume.topology import Topology
 Tensor = torch.Tensor
 
 
-def zero_rows(shape: tuple[int, ...], device: torch.device | str = "cpu", dtype: torch.dtype = torch.float32) -> Tensor:
-    """Zeros; on the CPU those that are never written take no memory (`memory.pages`)."""
+def zero_rows(
+    shape: tuple[int, ...], device: torch.device | str = "cpu", dtype: torch.dtype = torch.float32, folder: Path | None = None
+) -> Tensor:
+    """Zeros; on the CPU those that are never written take no memory, and more than there is memory for are a file in `folder`, if that is
+    given (`memory.pages`)."""
     device, count = torch.device(device), math.prod(shape)
     if device.type != "cpu" or count == 0:
         return torch.zeros(shape, dtype=dtype, device=device)
-    return torch.frombuffer(memory.pages(count * dtype.itemsize), dtype=dtype).view(shape)
+    return torch.frombuffer(memory.pages(count * dtype.itemsize, folder), dtype=dtype).view(shape)
 
 
 @dataclass(frozen=True)
@@ -34,10 +38,10 @@ class Hosted:
     feature: Tensor  # (M · 512 + 1, C)
 
 
-def plain_rows(topology: Topology, channels: int) -> Hosted:
-    """Zeroed rows for blocks, as ordinary tensors on their device."""
-    size = topology.zero_row + 1
-    return Hosted(topology, zero_rows((size,), topology.device), zero_rows((size, channels), topology.device))
+def plain_rows(topology: Topology, channels: int, folder: Path | None = None) -> Hosted:
+    """Zeroed rows for blocks, as ordinary tensors on their device; `folder`: see `zero_rows`."""
+    size, device = topology.zero_row + 1, topology.device
+    return Hosted(topology, zero_rows((size,), device, folder=folder), zero_rows((size, channels), device, folder=folder))
 
 
 class Host(Protocol):

@@ -31,6 +31,7 @@ class CellPlan:
     Attributes:
         cell: which one.
         rays_before: that the coarse field was fitted with.
+        done_before: share of the whole fit that the coarse field took.
         share: of the scene's pixels that are the cell's: with so much fewer rays it comes as far.
         seconds, steps: of the cell's fit, whichever are spent first; `steps` None: seconds alone.
         slow_within: see `Schedule`.
@@ -41,6 +42,7 @@ class CellPlan:
 
     cell: int
     rays_before: int
+    done_before: float
     share: float
     seconds: float
     steps: int | None
@@ -84,7 +86,8 @@ def fit_cell(
     policy = NonfinitePolicy()
     rays = steps = 0
     batch = max(LEAST_BATCH, round(settings.fit.max_rays * plan.share))
-    while (done := schedule.position(now := ticks() - begin)) < 1 and not progress.stopping():
+    while (spent := schedule.position(now := ticks() - begin)) < 1 and not progress.stopping():
+        done = plan.done_before + (1 - plan.done_before) * spent  # of the whole fit: step sizes fall as in one piece
         if schedule.wants_pruning(done):
             current = pruned(current, visible(current, engine.seen, engine.visits, settings.fit.prune_weight))
             engine.go_on_with(current)
@@ -101,7 +104,7 @@ def fit_cell(
         steps += 1
         rays += batch
         if steps % 20 == 0:
-            progress.update(done, 1, f"{schedule.resolution}³")
+            progress.update(spent, 1, f"{schedule.resolution}³")
     field = replace(current, outer=None).settled()
     return FittedCell(field, ticks() - begin, steps, rays, progress.stopping())
 

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Callable
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -13,7 +14,7 @@ from fieldfuse.render.field import Field
 from fieldfuse.training.cells.partition import Cells
 from fieldfuse.training.levels import in_rows
 from fieldfuse.volume.edit import corner_nodes
-from fieldfuse.volume.host import plain_rows
+from fieldfuse.volume.host import Hosted, plain_rows
 from fieldfuse.volume.topology import VOXELS, Topology
 
 Array = np.ndarray[Any, Any]
@@ -23,30 +24,38 @@ class NotCoveredError(FieldfuseError):
     """A part of the scene is missing from what the cells gave."""
 
 
-def merged(coarse: Field, cells: Cells, fields: Mapping[int, Field]) -> Field:
-    """One field of those of some cells, by their numbers, each with the halo that it was fitted with.
+def merged(coarse: Field, cells: Cells, load: Callable[[int], Field], folder: Path | None = None) -> Field:
+    """One field of those of all cells, each with the halo that it was fitted with. One cell at a time is in memory.
 
     A corner of a voxel that lies on a border belongs to the block it lies in, and so to that block's owner; where the owner has no use for
     it (its own voxels there are empty), the neighbour's value stays.
+
+    Args:
+        load: gives the field of a cell, each twice.
+        folder: for what there is not enough memory for (`memory.pages`).
     """
-    resolution, channels = next((field.resolution, field.feature_rows.shape[1]) for field in fields.values())
-    ratio = resolution // coarse.resolution
-    keys = torch.from_numpy(np.unique(np.concatenate([field.topology.keys.numpy() for field in fields.values()]), axis=0))
-    topology = Topology(keys)
-    rows = plain_rows(topology, channels)
-    occupied = torch.zeros(topology.zero_row, dtype=torch.bool)
-    owner = cells.owner_of(keys.numpy(), ratio)
-    for owned in (False, True):  # what a cell owns is written last
-        for index, field in fields.items():
-            slots = topology.find(field.topology.keys)
-            mine = torch.from_numpy(owner[slots.numpy()] == index)
-            used = (corner_nodes(field.topology, field.occupied).view(-1, VOXELS) & (mine == owned)[:, None]).nonzero()
-            source, target = used[:, 0] * VOXELS + used[:, 1], slots[used[:, 0]] * VOXELS + used[:, 1]
-            rows.density[target], rows.feature[target] = field.density_rows[source], field.feature_rows[source]
+    keys = np.concatenate([load(cell).topology.keys.numpy() for cell in range(cells.count)])
+    topology = Topology(torch.from_numpy(np.unique(keys, axis=0)))
+    rows: Hosted | None = None
+    occupied, final = (torch.zeros(topology.zero_row, dtype=torch.bool) for _ in range(2))
+    for cell in range(cells.count):
+        field = load(cell)
+        rows = rows or plain_rows(topology, field.feature_rows.shape[1], folder)
+        slots = topology.find(field.topology.keys)
+        mine = torch.from_numpy(cells.owner_of(field.topology.keys.numpy(), field.resolution // coarse.resolution) == cell)
+        used = corner_nodes(field.topology, field.occupied).view(-1, VOXELS)
+        for owned in (False, True):
+            place = (used & (mine == owned)[:, None]).nonzero()
+            source, target = place[:, 0] * VOXELS + place[:, 1], slots[place[:, 0]] * VOXELS + place[:, 1]
             if owned:
-                inside = slots[mine][:, None] * VOXELS + torch.arange(VOXELS)
-                occupied[inside] = field.occupied.view(-1, VOXELS)[mine]
-    return in_rows(coarse, rows, occupied, resolution).settled()
+                final[target] = True
+            else:
+                source, target = source[~final[target]], target[~final[target]]
+            rows.density[target], rows.feature[target] = field.density_rows[source], field.feature_rows[source]
+        occupied.view(-1, VOXELS)[slots[mine]] = field.occupied.view(-1, VOXELS)[mine]
+        resolution = field.resolution
+    assert rows is not None
+    return in_rows(coarse, rows, occupied, resolution).settled(folder)
 
 
 def check_coverage(coarse: Field, seen: Array, cells: Cells, result: Field) -> list[str]:

@@ -247,6 +247,7 @@ def fit_cell_of(argument: tuple[str, int], progress: Progress, ticks: Callable[[
     of_cell = CellPlan(
         cell=cell,
         rays_before=plan.rays_before,
+        done_before=COARSE_SHARE,
         share=plan.shares[cell],
         seconds=plan.seconds[cell],
         steps=None if plan.steps is None else plan.steps[cell],
@@ -274,5 +275,5 @@ def merge_scene(folder: Path, plan: ScenePlan) -> tuple[Field, list[str]]:
     coarse, cells, rays = coarse_of(folder, plan.key)
     if absent := missing(folder, plan):
         raise NotCoveredError(f"{len(absent)} of {plan.count} cells are not fitted; start the run again, and it fits them")
-    field = merged(coarse, cells, {cell: Field.load(cell_path(folder, cell)) for cell in range(plan.count)})
+    field = merged(coarse, cells, lambda cell: Field.load(cell_path(folder, cell)), folder)
     return field, check_coverage(coarse, rays, cells, field)
