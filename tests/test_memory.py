@@ -6,6 +6,7 @@ import mmap
 import os
 import subprocess
 import sys
+import tempfile
 from pathlib import Path
 from types import SimpleNamespace
 
@@ -99,20 +100,18 @@ def test_pages_that_nobody_writes_take_no_memory() -> None:
 
 
 def test_pages_that_do_not_fit_into_memory_are_a_file_without_a_name(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    assert not mapped(tmp_path)
+    monkeypatch.setattr(tempfile, "tempdir", str(tmp_path))
     monkeypatch.setattr(memory, "available", lambda: memory.SPARE + 2**23)
-    fits, buffer = memory.pages(2**22, tmp_path), memory.pages(2**23, tmp_path)
+    fits, buffer = memory.pages(2**22, spill=True), memory.pages(2**23, spill=True)
     assert mapped(tmp_path) == [2**23] and not list(tmp_path.iterdir())
     values = np.frombuffer(buffer, np.uint8)
     assert not values.any() and values.flags.writeable
     values[5] = 1
-    assert len(memory.pages(2**30)) == 2**30  # without a folder it is memory
+    assert len(memory.pages(2**30)) == 2**30  # memory, if it must be
     del values, buffer, fits
     assert not mapped(tmp_path)
-    with pytest.raises(InputError, match=r"needs about \d+\.0 GB of memory or disk, and 0\.1 GB of memory and .* on the disk of"):
-        memory.pages(2**55, tmp_path)
-    with pytest.raises(InputError, match=r"which cannot be made .*copy the field to a folder that can be written"):
-        memory.pages(2**23, tmp_path / "nowhere")
+    with pytest.raises(InputError, match=r"of memory or disk, and 0\.1 GB of memory and .* GB in .* are free; .* TMPDIR"):
+        memory.pages(2**55, spill=True)
 
 
 def resident() -> int:

@@ -42,6 +42,7 @@ SCORE_BYTES = 320  # a pixel of the picture that is being scored
 KEPT_BYTES = 8  # a pixel of a picture that is kept until all are there: colour, depth, mask
 SURFACE_BYTES = 40  # the same when depth maps are made to agree before they become a surface: 33 measured
 PICTURE_BYTES = 8  # of a picture that depth is polished by: its colours, and its grey levels with those beside them
+SEEN_BYTES = 12  # a corner of a field while what views see of it is noted, by two threads: 10 measured
 ROW_COPIES = 3  # of a field's values while it is baked: its own, sorted ones for the range, the bytes
 MESH_COPIES = 6  # of a mesh file's size in memory while meshes are compared: float64, a tree to search in, samples
 
@@ -111,6 +112,19 @@ def require_baking(field: Field) -> None:
     require(ROW_COPIES * size, f"baking a field of {field.blocks:,} blocks", "fit it at a lower resolution (field.resolution)")
 
 
+def require_splats(field: Field, sums: int) -> None:
+    """Refuse to make splats of a field when what is noted of its voxels does not fit.
+
+    Args:
+        sums: bytes that threads collect light in.
+
+    Raises:
+        InputError: with what is needed and what is free.
+    """
+    size = SEEN_BYTES * len(field.occupied) + sums
+    require(size, f"making splats of a field of {field.blocks:,} blocks", "fit it at a lower resolution (field.resolution)")
+
+
 def require_meshes(paths: Sequence[Path]) -> None:
     """Refuse to compare meshes that do not fit.
 
@@ -146,21 +160,24 @@ def workers(wanted: int, each: int, what: str, advice: str) -> int:
     return max(1, min(wanted, (available() - SPARE) // max(1, each)))
 
 
-def pages(size: int, folder: Path | None = None) -> mmap.mmap | bytearray:
+def pages(size: int, spill: bool = False) -> mmap.mmap | bytearray:
     """`size` bytes, all zero, for what will be written here and there: where nothing is written they take no memory, page by page. (What
     NumPy gives begins so, too, but on systems with huge pages a byte that is written takes 2 MB.)
 
     Args:
-        folder: where these bytes become a file, if they are more than `IN_MEMORY` of what can still be had: the system keeps in memory what
-            is in use. The file has no name and goes with the last reference.
+        spill: if these bytes are more than `IN_MEMORY` of what can still be had, they are a file in the folder for temporary files
+            (TMPDIR), of which the system keeps in memory what is in use. It has no name and goes with the last reference.
 
     Raises:
-        InputError: they are that many, and the folder's disk has no room for them.
+        InputError: they are to be a file, and the disk has no room for them.
     """
     if size == 0 or not hasattr(mmap, "MAP_PRIVATE"):
         return bytearray(size)
-    if folder is not None and size > IN_MEMORY * (available() - SPARE):
-        return _file_pages(size, folder)
+    if spill and size > IN_MEMORY * (available() - SPARE):
+        require_place(size, "a field that does not fit into memory")
+        with tempfile.TemporaryFile() as file:
+            file.truncate(size)
+            return mmap.mmap(file.fileno(), size)
     out = mmap.mmap(-1, size, flags=mmap.MAP_PRIVATE | mmap.MAP_ANONYMOUS)
     if hasattr(mmap, "MADV_NOHUGEPAGE"):
         with suppress(OSError):  # a kernel without huge pages
@@ -168,19 +185,8 @@ def pages(size: int, folder: Path | None = None) -> mmap.mmap | bytearray:
     return out
 
 
-def _file_pages(size: int, folder: Path) -> mmap.mmap:
-    try:
-        require_place(size, folder, "a field that does not fit into memory")
-        with tempfile.TemporaryFile(dir=folder) as file:
-            file.truncate(size)
-            return mmap.mmap(file.fileno(), size)
-    except OSError as error:
-        reason = f"a field that does not fit into memory needs a file of {size / GIB:.1f} GB in {folder}"
-        raise InputError(f"{reason}, which cannot be made ({error.strerror}); copy the field to a folder that can be written") from error
-
-
-def require_place(size: int, folder: Path, what: str) -> None:
-    """Refuse what would need `size` bytes, in memory or else on the disk of `folder`, when there are fewer.
+def require_place(size: int, what: str) -> None:
+    """Refuse what would need `size` bytes, in memory or else in the folder for temporary files, when there are fewer.
 
     Args:
         what: what needs them, the start of a sentence.
@@ -188,10 +194,12 @@ def require_place(size: int, folder: Path, what: str) -> None:
     Raises:
         InputError: naming both numbers.
     """
-    there, free = available(), shutil.disk_usage(folder).free
+    there, folder = available(), tempfile.gettempdir()
+    free = shutil.disk_usage(folder).free
     if size > max(there, free) - SPARE:
-        left = f"{there / GIB:.1f} GB of memory and {free / GIB:.1f} GB on the disk of {folder} are free"
-        raise InputError(f"{what} needs about {size / GIB:.1f} GB of memory or disk, and {left}; free some, or use another machine")
+        left = f"{there / GIB:.1f} GB of memory and {free / GIB:.1f} GB in {folder} are free"
+        advice = "free some, or set TMPDIR to a folder on a larger disk"
+        raise InputError(f"{what} needs about {size / GIB:.1f} GB of memory or disk, and {left}; {advice}")
 
 
 def unwritten(shape: tuple[int, ...], dtype: Any) -> NDArray[Any]:

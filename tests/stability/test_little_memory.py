@@ -115,6 +115,14 @@ def test_an_export_leaves_out_the_meshes_that_do_not_fit_and_says_so(finished: P
     assert (finished / "exports" / "cameras" / "transforms.json").is_file() and not (finished / "exports" / "mesh.obj").is_file()
 
 
+def test_an_export_leaves_out_the_splats_that_do_not_fit_and_says_so(finished: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(memory, "SEEN_BYTES", HUGE)
+    answer = fieldfuse("export", finished, "--formats", "splat,cameras", "--threads", "1", "--quiet", "--json")
+    assert answer.code == 0, answer
+    assert "the splats were left out: making splats of a field of" in answer.out and "GB is free" in answer.out
+    assert (finished / "exports" / "cameras" / "transforms.json").is_file() and not (finished / "exports" / "splat.ply").is_file()
+
+
 def test_prepared_pictures_that_do_not_fit_are_not_read(finished: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     allow(monkeypatch, 1000)
     answer = fieldfuse("render", finished, "--quiet")

@@ -100,28 +100,22 @@ class Field:
             background=self.background.to(device),
         )
 
-    def settled(self, folder: Path | None = None) -> Field:
-        """A copy in memory of its own, without the blocks that hold nothing. `folder`: see `packed`."""
-        return self.packed(folder)()
+    def settled(self) -> Field:
+        """A copy in memory of its own, without the blocks that hold nothing."""
+        return self.packed()()
 
-    def packed(self, folder: Path | None = None) -> Callable[[], Field]:
+    def packed(self) -> Callable[[], Field]:
         """What makes the copy that `settled` is; it holds the corners that voxels use and nothing else, so that the memory of this field's
-        rows can be freed before the copy's is taken: the end of a fit is when most is needed.
-
-        Args:
-            folder: for what there is not enough memory for (`memory.pages`).
-        """
+        rows can be freed before the copy's is taken: the end of a fit is when most is needed."""
         corners = corner_nodes(self.topology, self.occupied).view(-1, VOXELS)
         kept = corners.any(1).nonzero().view(-1)
         source = corners.view(-1).nonzero().view(-1)
-        density, feature = (compact(rows, source, folder=folder) for rows in (self.density_rows, self.feature_rows))
+        density, feature = (compact(rows, source) for rows in (self.density_rows, self.feature_rows))
         index, blocks = corners[kept].view(-1).nonzero().view(-1), len(kept)
         occupied = self.occupied.view(-1, VOXELS)[kept].view(-1)
         topology, none = Topology(self.topology.keys[kept]), (density[:0], feature[:0])
         rest = replace(self, topology=topology, occupied=occupied, density_rows=none[0], feature_rows=none[1])
-        return lambda: replace(
-            rest, density_rows=expand(density, index, blocks, folder), feature_rows=expand(feature, index, blocks, folder)
-        )
+        return lambda: replace(rest, density_rows=expand(density, index, blocks), feature_rows=expand(feature, index, blocks))
 
     def save(self, path: Path | str, working_from_input: Similarity | None = None, meta: dict[str, Any] | None = None) -> None:
         """Write `field.safetensors`, atomically; corners that no occupied voxel uses are left out.
@@ -146,8 +140,8 @@ class Field:
             keys=self.topology.keys,
             occupied=self.occupied.view(-1, VOXELS),
             node_index=nodes.int(),
-            features=compact(self.feature_rows, nodes, torch.float16, Path(path).parent),
-            density=compact(self.density_rows, nodes, folder=Path(path).parent),
+            features=compact(self.feature_rows, nodes, torch.float16),
+            density=compact(self.density_rows, nodes),
             decoder=dict(self.decoder.state_dict()),
             config=config,
             voxel_size=self.voxel_size,
@@ -159,7 +153,7 @@ class Field:
 
     @classmethod
     def load(cls, path: Path | str) -> Field:
-        """Read `field.safetensors`. What is too large for the memory is unpacked into files without a name beside it (`memory.pages`).
+        """Read `field.safetensors`. What is too large for the memory is unpacked into temporary files (`memory.pages`).
 
         Raises:
             InputError: the file is not a field, or was tampered with, or there is too little memory and disk for it.
@@ -191,8 +185,8 @@ class Field:
             resolution,
             Topology(data.keys),
             data.occupied.reshape(-1),
-            expand(data.density, data.node_index, blocks, path.parent),
-            expand(data.features, data.node_index, blocks, path.parent),
+            expand(data.density, data.node_index, blocks),
+            expand(data.features, data.node_index, blocks),
             decoder,
             background,
             near,

@@ -18,6 +18,7 @@ import cv2
 import numpy as np
 import torch
 
+from fieldfuse import memory
 from fieldfuse.backends.numba import splat_start as B
 from fieldfuse.backends.numba import splats as G
 from fieldfuse.camera import Array, Intrinsics, Similarity, pixel_grid, rays
@@ -122,6 +123,8 @@ class Targets:
 def start(field: Field, targets: Targets, settings: SplatSettings, progress: Progress = SILENT) -> Splats:
     """A Gaussian for each of the voxels that hold some of a pixel's light; where these are too many, for eight voxels together."""
     views = targets.views
+    threads = min(torch.get_num_threads(), MOST_THREADS)
+    memory.require_splats(field, 4 * B.SUMS * min(field.voxels, MOST_VOXELS) * (threads + 1))
     weight = seen_weights(field, views.intrinsics, views.world_from_camera, progress)
     chosen = (weight > SEEN).nonzero().view(-1)
     if len(chosen) > MOST_VOXELS:

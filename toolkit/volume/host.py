@@ -7,7 +7,6 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from pathlib import Path
 from typing import Protocol
 
 import torch
@@ -19,14 +18,13 @@ Tensor = torch.Tensor
 
 
 def zero_rows(
-    shape: tuple[int, ...], device: torch.device | str = "cpu", dtype: torch.dtype = torch.float32, folder: Path | None = None
+    shape: tuple[int, ...], device: torch.device | str = "cpu", dtype: torch.dtype = torch.float32, spill: bool = True
 ) -> Tensor:
-    """Zeros; on the CPU those that are never written take no memory, and more than there is memory for are a file in `folder`, if that is
-    given (`memory.pages`)."""
+    """Zeros; on the CPU those that are never written take no memory, and more than there is memory for are a file (`memory.pages`)."""
     device, count = torch.device(device), math.prod(shape)
     if device.type != "cpu" or count == 0:
         return torch.zeros(shape, dtype=dtype, device=device)
-    return torch.frombuffer(memory.pages(count * dtype.itemsize, folder), dtype=dtype).view(shape)
+    return torch.frombuffer(memory.pages(count * dtype.itemsize, spill), dtype=dtype).view(shape)
 
 
 @dataclass(frozen=True)
@@ -38,10 +36,10 @@ class Hosted:
     feature: Tensor  # (M · 512 + 1, C)
 
 
-def plain_rows(topology: Topology, channels: int, folder: Path | None = None) -> Hosted:
-    """Zeroed rows for blocks, as ordinary tensors on their device; `folder`: see `zero_rows`."""
+def plain_rows(topology: Topology, channels: int, spill: bool = False) -> Hosted:
+    """Zeroed rows for blocks, as ordinary tensors on their device; while they are fitted they belong into memory (`memory.keep_only`)."""
     size, device = topology.zero_row + 1, topology.device
-    return Hosted(topology, zero_rows((size,), device, folder=folder), zero_rows((size, channels), device, folder=folder))
+    return Hosted(topology, zero_rows((size,), device, spill=spill), zero_rows((size, channels), device, spill=spill))
 
 
 class Host(Protocol):

@@ -78,17 +78,13 @@ class FieldFile:
     version: int = VERSION
 
 
-def compact(rows: Tensor, node_index: Tensor, precision: torch.dtype = torch.float32, folder: Path | None = None) -> Tensor:
-    """(M · 512 [+ 1], …) float32 block rows → (R, …) values of the stored corners, in `precision` where all of them fit into it.
-
-    Args:
-        folder: for what there is not enough memory for (`host.zero_rows`).
-    """
-    out = zero_rows((len(node_index), *rows.shape[1:]), rows.device, precision, folder)
+def compact(rows: Tensor, node_index: Tensor, precision: torch.dtype = torch.float32) -> Tensor:
+    """(M · 512 [+ 1], …) float32 block rows → (R, …) values of the stored corners, in `precision` where all of them fit into it."""
+    out = zero_rows((len(node_index), *rows.shape[1:]), rows.device, precision)
     for part, index in zip(out.split(AT_ONCE), node_index.split(AT_ONCE), strict=True):
         values = rows.detach().index_select(0, index)
         if precision != torch.float32 and largest(values) > torch.finfo(precision).max:  # they would become infinite
-            return compact(rows, node_index, folder=folder)
+            return compact(rows, node_index)
         part.copy_(values)
     return out
 
@@ -98,13 +94,9 @@ def largest(values: Tensor) -> float:
     return max(map(abs, map(float, torch.aminmax(values.detach())))) if values.numel() else 0.0
 
 
-def expand(values: Tensor, node_index: Tensor, blocks: int, folder: Path | None = None) -> Tensor:
-    """(R, …) stored values → (blocks · 512 + 1, …) float32 block rows; what is not stored, and the zero row at the end, is zero.
-
-    Args:
-        folder: for what there is not enough memory for (`host.zero_rows`).
-    """
-    rows = zero_rows((blocks * VOXELS + 1, *values.shape[1:]), values.device, folder=folder)
+def expand(values: Tensor, node_index: Tensor, blocks: int) -> Tensor:
+    """(R, …) stored values → (blocks · 512 + 1, …) float32 block rows; what is not stored, and the zero row at the end, is zero."""
+    rows = zero_rows((blocks * VOXELS + 1, *values.shape[1:]), values.device)
     for part, index in zip(values.split(AT_ONCE), node_index.split(AT_ONCE), strict=True):
         rows.index_copy_(0, index.long(), part.float())
     return rows
@@ -170,11 +162,11 @@ def read_field(path: Path | str) -> FieldFile:
                 if name not in _DTYPES and not name.startswith("decoder."):
                     raise _Unusable(f"it holds an unknown tensor {name[:40]!r}")
             # Copies, because the originals are windows into the file, which may change under them.
-            tensors = {name: _copied(source.get_tensor(name), path.parent) for name in names}
+            tensors = {name: _copied(source.get_tensor(name)) for name in names}
         data = _checked(tensors, metadata[METADATA_KEY])
         # A few bytes of keys stand for kilobytes of rows: what a small file unpacks to is looked at before anybody unpacks it.
         unpacked = len(data.keys) * VOXELS * (4 * (data.features.shape[1] + 1) + 1)
-        memory.require_place(unpacked, path.parent, f"the field {path}")
+        memory.require_place(unpacked, f"the field {path}")
         return data
     except FieldfuseError:
         raise
@@ -183,9 +175,8 @@ def read_field(path: Path | str) -> FieldFile:
         raise InputError(f"{path} cannot be used, because {why}; fit the field again or take another copy of the file") from error
 
 
-def _copied(values: Tensor, folder: Path) -> Tensor:
-    out = zero_rows(tuple(values.shape), dtype=values.dtype, folder=folder)
-    return out.copy_(values)
+def _copied(values: Tensor) -> Tensor:
+    return zero_rows(tuple(values.shape), dtype=values.dtype).copy_(values)
 
 
 class _Unusable(Exception):

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -24,7 +23,7 @@ class NotCoveredError(FieldfuseError):
     """A part of the scene is missing from what the cells gave."""
 
 
-def merged(coarse: Field, cells: Cells, load: Callable[[int], Field], folder: Path | None = None) -> Field:
+def merged(coarse: Field, cells: Cells, load: Callable[[int], Field]) -> Field:
     """One field of those of all cells, each with the halo that it was fitted with. One cell at a time is in memory.
 
     A corner of a voxel that lies on a border belongs to the block it lies in, and so to that block's owner; where the owner has no use for
@@ -32,7 +31,6 @@ def merged(coarse: Field, cells: Cells, load: Callable[[int], Field], folder: Pa
 
     Args:
         load: gives the field of a cell, each twice.
-        folder: for what there is not enough memory for (`memory.pages`).
     """
     keys = np.concatenate([load(cell).topology.keys.numpy() for cell in range(cells.count)])
     topology = Topology(torch.from_numpy(np.unique(keys, axis=0)))
@@ -40,7 +38,7 @@ def merged(coarse: Field, cells: Cells, load: Callable[[int], Field], folder: Pa
     occupied, final = (torch.zeros(topology.zero_row, dtype=torch.bool) for _ in range(2))
     for cell in range(cells.count):
         field = load(cell)
-        rows = rows or plain_rows(topology, field.feature_rows.shape[1], folder)
+        rows = rows or plain_rows(topology, field.feature_rows.shape[1], spill=True)
         slots = topology.find(field.topology.keys)
         mine = torch.from_numpy(cells.owner_of(field.topology.keys.numpy(), field.resolution // coarse.resolution) == cell)
         used = corner_nodes(field.topology, field.occupied).view(-1, VOXELS)
@@ -55,7 +53,7 @@ def merged(coarse: Field, cells: Cells, load: Callable[[int], Field], folder: Pa
         occupied.view(-1, VOXELS)[slots[mine]] = field.occupied.view(-1, VOXELS)[mine]
         resolution = field.resolution
     assert rows is not None
-    return in_rows(coarse, rows, occupied, resolution).settled(folder)
+    return in_rows(coarse, rows, occupied, resolution).settled()
 
 
 def check_coverage(coarse: Field, seen: Array, cells: Cells, result: Field) -> list[str]:

@@ -275,5 +275,5 @@ def merge_scene(folder: Path, plan: ScenePlan) -> tuple[Field, list[str]]:
     coarse, cells, rays = coarse_of(folder, plan.key)
     if absent := missing(folder, plan):
         raise NotCoveredError(f"{len(absent)} of {plan.count} cells are not fitted; start the run again, and it fits them")
-    field = merged(coarse, cells, lambda cell: Field.load(cell_path(folder, cell)), folder)
+    field = merged(coarse, cells, lambda cell: Field.load(cell_path(folder, cell)))
     return field, check_coverage(coarse, rays, cells, field)
