@@ -27,7 +27,8 @@ Sources = Annotated[
     list[Path], typer.Argument(help="Captures, or lists of them (.csv): a column source, name, and options of run.", show_default=False)
 ]
 DryRun = Annotated[bool, typer.Option("--dry-run", help="Say what would be run, and what it takes; start nothing.")]
-PAGE_EVERY = 2.0  # seconds between two versions of the page
+PAGE_EVERY = 2.0  # seconds between two versions of the page, or
+PAUSES = 20  # times as long as it takes to write one: of 10,000 runs that is a second
 MOST_UPLOAD = 2 * 2**30  # bytes of a capture that is sent
 GB = 1e9
 RESTING = {"stage": None, "share": None, "left": None}  # of a run that is not at work
@@ -137,7 +138,7 @@ class Batch:
     def __init__(self, out: Path, runs: Sequence[Planned], cluster: ClusterOptions) -> None:
         self.out, self.cluster = out.absolute(), cluster
         self._thumbnails: dict[str, str] = {}
-        self._written = 0.0
+        self._written, self._pause = 0.0, PAGE_EVERY
         before = earlier(self.out)
         self.entries = {one.name: Entry(one, self._row(one, before.get(one.name))) for one in runs}
         self.todo = [entry for entry in self.entries.values() if entry.row["state"] != "done"]
@@ -189,7 +190,8 @@ class Batch:
             for task, outcome in workers.run(execute, tasks, listen):
                 self._ended(self.entries[task.name], outcome)
                 shown.changed(self.entries[task.name].row)
-                self.write(PAGE_EVERY)
+                if time.monotonic() - self._written >= self._pause:
+                    self.write()
         return self.write()
 
     def _specs(self, workers: Workers, shown: Display) -> list[Task]:
@@ -257,17 +259,18 @@ class Batch:
         if (image := thumbnail(self.out / name)) is not None:
             self._thumbnails[name] = image
 
-    def write(self, every: float = 0.0) -> dict[str, Any]:
-        """The page, and `batch.json`, unless they were written less than so many seconds ago; answers what the latter holds."""
+    def write(self) -> dict[str, Any]:
+        """The page, and `batch.json`; answers what the latter holds."""
         from fieldfuse.evaluation.batch_page import batch_data, write_batch
         from fieldfuse.pipelines.folder import command_line
 
         rows = [{key: value for key, value in entry.row.items() if key not in RESTING} for entry in self.entries.values()]
         created = datetime.now(UTC).isoformat(timespec="seconds")
         data = batch_data({"command": command_line(), "created": created, "runs": rows})
-        if time.monotonic() - self._written >= every:
-            write_batch(self.out, data, self._thumbnails)
-            self._written = time.monotonic()
+        began = time.monotonic()
+        write_batch(self.out, data, self._thumbnails)
+        self._written = time.monotonic()
+        self._pause = max(PAGE_EVERY, PAUSES * (self._written - began))
         return data
 
 

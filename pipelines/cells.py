@@ -104,9 +104,11 @@ def _fit_missing(job: Job, folder: Path, plan: cells.ScenePlan, workers: Workers
     if not missing:
         return
     shares = dict.fromkeys(missing, 0.0)
-    tasks = [Task(f"cell {cell + 1}", (str(folder), cell)) for cell in missing]
+    tasks = [Task(f"cell {cell + 1}", (str(folder), cell), memory=plan.memory[cell]) for cell in missing]
+    if refusal := next(filter(None, map(workers.too_large, tasks)), None):
+        raise InputError(f"{refusal}; give more --cells, or add a node")
     failed: list[str] = []
-    at_once = workers.at_once(tasks[0])
+    at_once = workers.at_once(max(tasks, key=lambda task: task.memory))
 
     def show() -> None:
         done = plan.count - len(missing) + sum(shares.values())

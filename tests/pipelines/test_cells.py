@@ -96,6 +96,14 @@ def test_a_run_that_is_killed_goes_on_with_the_missing_cell(
     assert same(fitted, out)
 
 
+def test_cells_that_no_node_has_memory_for_are_refused_by_name(room: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(cells, "CORNER_BYTES", 10**6)
+    monkeypatch.setattr("fieldfuse.pipelines.cells.open_workers", workers_here)
+    answer = said("run", room, "--out", tmp_path / "out", *OPTIONS)
+    assert answer.code == 2 and "cell 1 needs 1 cores" in answer.err and "give more --cells, or add a node" in answer.err, answer.err
+    assert (tmp_path / "out" / "cells" / "plan.json").is_file()  # the coarse fit is kept
+
+
 def test_a_small_scene_stays_in_one_piece(room: Path, tmp_path: Path) -> None:
     answer = said("run", room, "--out", tmp_path / "out", *SMALL, "--cells", "auto", "--set", "export.formats=[]")
     assert answer.code == 0 and "small enough to be fitted in one piece" in answer.out

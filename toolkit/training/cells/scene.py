@@ -36,7 +36,7 @@ from fieldfuse.render.bake import seen_weights
 from fieldfuse.render.field import Field
 from fieldfuse.training.cells.fit import COARSER, CellPlan, FittedCell, fit_cell
 from fieldfuse.training.cells.merge import NotCoveredError, check_coverage, merged
-from fieldfuse.training.cells.partition import Cells, cut
+from fieldfuse.training.cells.partition import Cells, cut, region_mask
 from fieldfuse.training.cells.pixels import Sight, pools
 from fieldfuse.training.engine import warm_up
 from fieldfuse.training.fit import DEFAULT_BUDGET, FitResult
@@ -49,6 +49,8 @@ from fieldfuse.volume.edit import dilate
 COARSE_SHARE = 0.55  # of the seconds or steps of the whole fit: one in one piece comes to its finest lattice as late
 LEAST_RESOLUTION = 32  # of a coarse field
 PIXELS_A_CELL = 8_000_000  # of training images, where the number of cells is chosen (`auto`)
+# Memory of a cell's fit: libraries, kernels and the coarse field; a value of a lattice corner, with what Adam keeps of it.
+BASE, CORNER_BYTES = 700 * 2**20, 12
 COARSE, CELLS, PLAN = "coarse.safetensors", "cells.safetensors", "plan.json"
 
 
@@ -64,6 +66,7 @@ class ScenePlan:
         rays_before, seconds_before: that the coarse field took.
         shares: of the scene's pixels, by cell; a pixel may be seen in several.
         seconds, steps: of each cell, None: without end.
+        memory: bytes that the fit of each takes at most, roughly.
         slow_within: working units.
         rough: whether depth was matched quickly, and is trusted less.
         opaque: whether every ray ends somewhere.
@@ -78,6 +81,7 @@ class ScenePlan:
     shares: list[float]
     seconds: list[float]
     steps: list[int] | None
+    memory: list[int]
     slow_within: float
     rough: bool
     opaque: bool
@@ -137,12 +141,16 @@ def write_scene(
     coarse.save(folder / COARSE, scene.working_from_input)
     owners = {"keys": cells.keys, "owner": cells.owner, "rays": rays}
     write_tensors(folder / CELLS, {name: torch.from_numpy(np.ascontiguousarray(values)) for name, values in owners.items()})
-    whole, sizes = sum(lens.width * lens.height for lens in train.intrinsics), []
+    whole, sizes, memory = sum(lens.width * lens.height for lens in train.intrinsics), [], []
     for cell, pool in enumerate(pools(train, cells, sight, settings.fit.depth > 0)):
         progress.check()
         progress.update(cell, cells.count, "pixels of cells")
         sizes.append(len(pool))
-        write_tensors(folder / f"pixels-{cell:03}.safetensors", pool.arrays(), {"height": str(pool.height)})
+        arrays = pool.arrays()
+        write_tensors(folder / f"pixels-{cell:03}.safetensors", arrays, {"height": str(pool.height)})
+        region = int(region_mask(coarse, cells, cell, coarse.resolution, COARSER * coarse.resolution).sum())
+        corners = COARSER**3 * region * CORNER_BYTES * (coarse.feature_rows.shape[1] + 1)
+        memory.append(BASE + 2 * sum(values.nbytes for values in arrays.values()) + corners)
     parts = [(1 - COARSE_SHARE) * size / sum(sizes) for size in sizes]
     # What a fit in one piece would have on this machine: cells have one thread each, however many are fitted side by side.
     budget, steps = (settings.fit.budget or DEFAULT_BUDGET) * (settings.threads or torch.get_num_threads()), settings.fit.iterations
@@ -156,6 +164,7 @@ def write_scene(
         shares=[size / whole for size in sizes],
         seconds=[part * budget for part in parts],
         steps=None if steps is None else [max(1, round(part * steps)) for part in parts],
+        memory=memory,
         slow_within=settings.fit.slow_within * scene.median_depth,
         rough=shown.rough,
         opaque=shown.background is None,
