@@ -87,7 +87,9 @@ class Bench:
     def row(self, way: str, folder: Path) -> Row:
         warm_up(self.settings, SILENT)
         field, seconds, memory = self.in_cells(folder) if way == "cells" else self.in_one_piece()
-        return {**self.scores(field), "seconds": round(seconds, 1), "memory_mb": round(memory), "voxels": field.voxels}
+        lenses = [lens for lens, test in zip(self.views.intrinsics, self.views.test, strict=True) if not test]
+        facts = {"seconds": round(seconds, 1), "memory_mb": round(memory), "voxels": field.voxels}
+        return {**self.scores(field), **facts, "megapixels": round(sum(lens.width * lens.height for lens in lenses) / 1e6, 2)}
 
     def in_one_piece(self) -> tuple[Field, float, float]:
         with Watch() as watch:
