@@ -83,7 +83,7 @@ def nothing(_: Any, __: Progress) -> None:
 
 def a_task() -> float:
     """Seconds of the machine that starts them, for a task that does nothing."""
-    tasks = [Task(str(number), number, cpus=0.01) for number in range(NOTHING)]
+    tasks = [Task(str(number), number) for number in range(NOTHING)]
     with open_workers(cpus=1) as workers:
         for _ in workers.run(nothing, tasks[:8]):
             pass  # workers are there now

@@ -64,6 +64,7 @@ class Schedule:
         rungs: share of the budget at which each level of the ladder ends at the latest.
         steps, steps_here: taken so far, in all and at this level.
         wider: times as many rays a step as `FIRST_BATCH` and `fit.max_rays`.
+        prune_every: steps from one pruning to the next.
     """
 
     ladder: list[int]
@@ -76,6 +77,7 @@ class Schedule:
     trust: Trust = FINE
     rungs: tuple[float, ...] = RUNGS
     wider: int = 1
+    prune_every: int = PRUNE_EVERY
     level: int = 0
     steps: int = 0
     steps_here: int = 0
@@ -179,7 +181,7 @@ class Schedule:
         self.looks.clear()
 
     def wants_pruning(self, done: float) -> bool:
-        every = self.settings.split_every or PRUNE_EVERY
+        every = self.settings.split_every or self.prune_every
         return self.steps_here > 0 and self.steps_here % every == 0 and done < LAST_PRUNE
 
     def rates(self, done: float, rays: int) -> Rates:

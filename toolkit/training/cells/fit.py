@@ -15,7 +15,7 @@ from fieldfuse.training.losses import Trust
 from fieldfuse.training.nonfinite_policy import NonfinitePolicy, NotFiniteError
 from fieldfuse.training.numba_engine import NumbaEngine
 from fieldfuse.training.pixels import PixelPool
-from fieldfuse.training.schedule import Schedule
+from fieldfuse.training.schedule import PRUNE_EVERY, Schedule
 from fieldfuse.volume.host import TorchHost
 
 # Times that cells' lattice is finer than the coarse field's. With 4 the coarse surfaces of neighbours, four voxels thick, hide so much that
@@ -82,10 +82,11 @@ def fit_cell(
     current = replace(finer(coarse, region, finest, TorchHost()), outer=rest)
     engine = NumbaEngine(current, pool, plan.seed, threads=1)
     fit = replace(settings.fit, iterations=plan.steps)
-    schedule = Schedule([finest], plan.seconds, fit, plan.opaque, slow_within=plan.slow_within, trust=plan.trust)
+    batch = max(LEAST_BATCH, round(settings.fit.max_rays * plan.share))
+    often = PRUNE_EVERY * max(1, settings.fit.max_rays // batch)  # as many rays as in one piece: to prune takes as long as many steps
+    schedule = Schedule([finest], plan.seconds, fit, plan.opaque, slow_within=plan.slow_within, trust=plan.trust, prune_every=often)
     policy = NonfinitePolicy()
     rays = steps = 0
-    batch = max(LEAST_BATCH, round(settings.fit.max_rays * plan.share))
     while (spent := schedule.position(now := ticks() - begin)) < 1 and not progress.stopping():
         done = plan.done_before + (1 - plan.done_before) * spent  # of the whole fit: step sizes fall as in one piece
         if schedule.wants_pruning(done):
