@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from functools import lru_cache
 from typing import Any
 
 import numpy as np
@@ -13,6 +14,7 @@ from fieldfuse.backends.numba.volume import chessboard_distance
 from fieldfuse.nerfusion.decoder import Deferred
 from fieldfuse.render.composite import STOP, THRESHOLD
 from fieldfuse.render.field import Field
+from fieldfuse.render.march import MarchGrid
 from fieldfuse.threads import share
 from fieldfuse.volume.topology import VOXELS
 
@@ -51,7 +53,7 @@ def make_volume(field: Field) -> K.Volume:
         around = field.outer
         x, y, z = (int(c) for c in around.topology.table_origin)
         outer = K.Outer(*_arrays(around), x, y, z, np.float32(around.resolution / field.resolution))
-        filled = filled | _on_finer_bricks(around.grid.bricks.numpy() > 0, len(filled))
+        filled = filled | _on_finer_bricks(around.grid, len(filled))
     bricks = np.where(filled, np.uint8(0), np.uint8(FARTHEST))
     chessboard_distance(bricks, FARTHEST)
     table, bits, upper, density, feature = _arrays(field)
@@ -67,8 +69,10 @@ def _arrays(field: Field) -> tuple[Array, Array, Array, Array, Array]:
     return topology.table.numpy(), bits, upper.numpy(), field.density_rows.detach().numpy(), field.feature_rows.detach().numpy()
 
 
-def _on_finer_bricks(filled: Array, width: int) -> Array:
-    """(B, B, B) bool bricks of a lattice, with a margin of one → those of a finer one, (width,) × 3, that touch any of them."""
+@lru_cache(maxsize=1)  # the outer field stays the same while a cell is fitted
+def _on_finer_bricks(grid: MarchGrid, width: int) -> Array:
+    """The bricks of a lattice that hold something, with a margin of one → those of a finer one, (width,) × 3, that touch any of them."""
+    filled = grid.bricks.numpy() > 0
     ratio = (len(filled) - 2) / (width - 2)
     place = np.arange(width) - 1
     low, high = np.floor(place * ratio).astype(int) + 1, np.ceil((place + 1) * ratio).astype(int)

@@ -15,7 +15,7 @@ from fieldfuse.training.losses import Trust
 from fieldfuse.training.nonfinite_policy import NonfinitePolicy, NotFiniteError
 from fieldfuse.training.numba_engine import NumbaEngine
 from fieldfuse.training.pixels import PixelPool
-from fieldfuse.training.schedule import PRUNE_EVERY, Schedule
+from fieldfuse.training.schedule import Schedule
 from fieldfuse.volume.host import TorchHost
 
 # Times that cells' lattice is finer than the coarse field's. With 4 the coarse surfaces of neighbours, four voxels thick, hide so much that
@@ -83,8 +83,7 @@ def fit_cell(
     engine = NumbaEngine(current, pool, plan.seed, threads=1)
     fit = replace(settings.fit, iterations=plan.steps)
     batch = max(LEAST_BATCH, round(settings.fit.max_rays * plan.share))
-    often = PRUNE_EVERY * max(1, settings.fit.max_rays // batch)  # as many rays as in one piece: to prune takes as long as many steps
-    schedule = Schedule([finest], plan.seconds, fit, plan.opaque, slow_within=plan.slow_within, trust=plan.trust, prune_every=often)
+    schedule = Schedule([finest], plan.seconds, fit, plan.opaque, slow_within=plan.slow_within, trust=plan.trust)
     policy = NonfinitePolicy()
     rays = steps = 0
     while (spent := schedule.position(now := ticks() - begin)) < 1 and not progress.stopping():
@@ -92,6 +91,7 @@ def fit_cell(
         if schedule.wants_pruning(done):
             current = pruned(current, visible(current, engine.seen, engine.visits, settings.fit.prune_weight))
             engine.go_on_with(current)
+            schedule.prune_every *= 2  # it takes as long as many steps of so few rays, and first does most
         whole = plan.rays_before + int(rays / max(plan.share, 1e-6))
         rates = replace(policy.scaled_rates(schedule.rates(done, whole)), decoder=0.0)
         try:
