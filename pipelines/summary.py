@@ -139,7 +139,7 @@ def exported_files(job: Job) -> list[dict[str, Any]]:
         {"path": path, "bytes": size}
         for record in records
         for path, size in record.outputs.items()
-        if path.startswith(("exports/", "tsdf/", "mesh")) and Path(path).suffix in OPENED and not path.endswith("facts.json")
+        if path.startswith(("exports/", "tsdf/", "mesh")) and Path(path).suffix in OPENED and not path.endswith(("facts.json", "field_parts/index.json"))
     ]
 
 
