@@ -4,7 +4,8 @@
 
 const LOOK = 250;  // milliseconds between two looks at what is near
 const AT_ONCE = 2;  // parts that are on their way
-const BEHIND = 3;  // a part that is not ahead counts as if it were so many times as far
+const AHEAD = 0.5;  // cosine to the direction of view of what is ahead …
+const BEHIND = 3;  // … and what is not counts as if it were so many times as far
 const STICKY = 1.2;  // a part goes for another that is nearer by this
 const AGAIN = 30000;  // milliseconds until a part that failed is asked for once more
 const SERVED = 'A coarse view of the whole scene: details load when this folder is served, as by `fieldfuse view DIR`.';
@@ -47,6 +48,7 @@ class Details {
     this.parts = index.parts.map(part => ({...part, slot: null, here: false, again: 0}));
     this.worker = partWorker();
     this.coarse = {keys: coarse.keys, table: coarse.table};  // the rest is on the graphics card
+    this.middle = this.middles();
     setInterval(() => this.look(), LOOK);
     this.look();
   }
@@ -91,21 +93,31 @@ class Details {
   // Number of the first block, voxel or corner of a place for a part.
   first(what, slot) { return this.own[what] + slot * this.most[what]; }
 
-  // Of all parts how far each is, in the lattice's space; farther where it is not ahead.
+  // Middles of the coarse blocks in the lattice's space, and behind all of them where these are, both in units of half the region's size.
+  middles() {
+    const {keys} = this.coarse, {shell, extent, voxel, tableOrigin} = this.about.march, out = new Float32Array(2 * keys.length);
+    for (let i = 0; i < keys.length; i += 3) {
+      const y = [0, 1, 2].map(axis => (keys[i + axis] + tableOrigin[axis] + 0.5) * 8 * voxel - extent), n = Math.max(...y.map(Math.abs));
+      out.set(y, i);
+      out.set(shell && n > 1 ? times(y, shell / Math.max(extent - n, 1e-4) / n) : y, keys.length + i);
+    }
+    return out;
+  }
+
+  // How far the nearest block of each part is in the lattice's space; farther where it is not ahead.
   distances() {
-    const {centre, halfSize, shell, extent} = this.about.march, {place, turn} = this.page.seen || this.page.view(1, 1), forward = turn.slice(6);
-    const largest = y => Math.max(...y.map(Math.abs));
-    const o = times(plus(place, centre, -1), 1 / halfSize), n = largest(o);
-    const eye = shell && n > 1 ? times(o, (extent - shell / n) / n) : o;
-    const world = y => {
-      const m = largest(y);
-      return shell && m > 1 ? times(y, shell / Math.max(extent - m, 1e-4) / m) : y;
-    };
+    const {centre, halfSize, shell, extent, voxel} = this.about.march, {place, turn} = this.page.seen || this.page.view(1, 1);
+    const [fx, fy, fz] = turn.slice(6), o = times(plus(place, centre, -1), 1 / halfSize), n = Math.max(...o.map(Math.abs));
+    const [x, y, z] = shell && n > 1 ? times(o, (extent - shell / n) / n) : o, {middle} = this, places = middle.length / 2;
     for (const part of this.parts) {
-      const [low, high] = part.box;
-      const away = Math.hypot(...eye.map((v, i) => Math.max(low[i] - v, 0, v - high[i])));
-      const ahead = [0, 1, 2, 3, 4, 5, 6, 7].some(corner => dot(forward, unit(plus(world(eye.map((_, i) => part.box[corner >> i & 1][i])), o, -1))) > 0.5);
-      part.away = away * (ahead ? 1 : BEHIND);
+      part.away = Infinity;
+      for (let block = part.coarse[0], i = 3 * block; block < part.coarse[0] + part.coarse[1]; block++, i += 3) {
+        const away = Math.hypot(middle[i] - x, middle[i + 1] - y, middle[i + 2] - z);
+        if (away >= part.away) continue;
+        const [dx, dy, dz] = [middle[places + i] - o[0], middle[places + i + 1] - o[1], middle[places + i + 2] - o[2]];
+        const ahead = away < 8 * voxel || dx * fx + dy * fy + dz * fz > AHEAD * Math.hypot(dx, dy, dz);
+        part.away = Math.min(part.away, ahead ? away : BEHIND * away);
+      }
     }
   }
 
