@@ -115,7 +115,9 @@ def test_a_field_that_fits_is_in_its_page_alone(tmp_path: Path) -> None:
     assert text == page(baked, tour(), "sphere") and PARTS not in text and "children" not in text and "//%" not in text
     for name in (*SCRIPTS, "march.frag", "decode.frag"):
         source = (WEB / name).read_text(encoding="utf-8")
-        source = re.sub(r"^ *//% if parts\n(?:(?! *//%).*\n)*?(?: *//% else\n((?:(?! *//%).*\n)*?))? *//% endif\n", r"\1", source, flags=re.MULTILINE)
+        source = re.sub(
+            r"^ *//% if parts\n(?:(?! *//%).*\n)*?(?: *//% else\n((?:(?! *//%).*\n)*?))? *//% endif\n", r"\1", source, flags=re.MULTILINE
+        )
         assert source in text, name
 
 
@@ -258,14 +260,19 @@ def test_what_cannot_be_loaded_stays_coarse(browser: Driven, served: str, tmp_pa
     until(lambda: browser.run(f"{HERE} === {len(rest)}"), SLOWEST)
     until(lambda: "some cannot be loaded" in words(browser, "details"))
     assert browser.run("heard.filter(text => text)") == ["Some details cannot be loaded; the scene stays coarse there."]
-    near, all_of_it = (np.abs(seen(browser, POSES[0]) - 255 * drawn(one, POSES[0]).rgb).mean() for one in (baked, coarse_of(field, baked, index["ratio"])))
+    near, all_of_it = (
+        np.abs(seen(browser, POSES[0]) - 255 * drawn(one, POSES[0]).rgb).mean() for one in (baked, coarse_of(field, baked, index["ratio"]))
+    )
     assert near > 0.3 and all_of_it > 0.3  # neither is all of the picture
     browser.run("fieldfuse.to(2)")
     until(lambda: browser.run("!fieldfuse.rough && fieldfuse.todo === 0 && !fieldfuse.walker.journey"), SLOWEST)  # it goes on
 
 
 @pytest.mark.usefixtures("small")
-@pytest.mark.parametrize(("text", "sentence"), [(None, "is not beside this page"), ('{"version": 1}', "belongs to another page"), ("{", "belongs to another page")])
+@pytest.mark.parametrize(
+    ("text", "sentence"),
+    [(None, "is not beside this page"), ('{"version": 1}', "belongs to another page"), ("{", "belongs to another page")],
+)
 def test_a_folder_that_is_not_the_pages_is_named(text: str | None, sentence: str, browser: Driven, served: str, tmp_path: Path) -> None:
     write_page(tmp_path / "field.html", bake(large_field()), tour(), "sphere")
     if text is None:
@@ -320,14 +327,14 @@ def test_tools_work_on_details(browser: Driven, served: str, tmp_path: Path) -> 
     browser.run("fieldfuse.tools.open('measure'), fieldfuse.tools.pick(80, 60), fieldfuse.tools.pick(84, 60)")
     assert 0.8 < np.linalg.norm(point) < 1 and 0 < browser.run("fieldfuse.tools.length") < 1
     before = seen(browser, POSES[1])
-    browser.run("fieldfuse.tools.region = [[-0.2, -2, -2], [2, 2, 2]], document.getElementById('cut').checked = true, fieldfuse.tools.cropped()")
+    browser.run(
+        "fieldfuse.tools.region = [[-0.2, -2, -2], [2, 2, 2]], document.getElementById('cut').checked = true, fieldfuse.tools.cropped()"
+    )
     assert np.abs(seen(browser, POSES[1]).astype(int) - before).mean() > 3
     browser.run("fieldfuse.tools.open(null), document.getElementById('share').click()")
     assert str(browser.run("location.hash")).startswith("#view=")
-    browser.run("window.eyes = 0, fieldfuse.plain = fieldfuse.draw")
-    browser.run("fieldfuse.draw = (...given) => { given[3] && eyes++; fieldfuse.plain(...given); }")
+    browser.run("window.pictures = 0, fieldfuse.plain = fieldfuse.draw")
+    browser.run("fieldfuse.draw = (...given) => { given[3] && pictures++; fieldfuse.plain(...given); }")
     browser.run("document.getElementById('vr').click()")
-    until(lambda: browser.run("eyes === 4 && !fieldfuse.away"), SLOWEST)
+    until(lambda: browser.run("pictures === 4 && !fieldfuse.away"), SLOWEST)
     assert all("404" in error for error in browser.errors)
-
-

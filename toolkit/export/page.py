@@ -43,7 +43,6 @@ MOST_BYTES = 25_000_000  # of a field in its page: a page of 33 MB, which a phon
 COARSEST = 16  # by how much, at most, what is in the page is coarser than the field
 DETAIL_BYTES = 400_000_000  # of textures for details at a time: a phone's browser gives a page about a gigabyte in all
 NEAREST_DEPTH, FARTHEST_DEPTH = 0.6, 2.5  # of the median depth: the range of depth's colours
-MARKS = {"block": "%", "variable": "=", "comment": "#"}  # of templates, where braces are the scripts' own
 SCRIPTS = ("unpack.js", "draw.js", "walk.js", "frame.js", "tools.js", "vr.js", "page.js")
 
 
@@ -104,7 +103,8 @@ def write_page(path: Path | str, field: BakedField, tour: Tour, title: str, whol
     Raises:
         OutputError: a file cannot be written.
     """
-    path, files = Path(path), []
+    path = Path(path)
+    files: list[Path] = []
     about, blob = packed(field, tour)
     inside = deflated(blob)
     if len(inside) > MOST_BYTES:
@@ -279,8 +279,12 @@ def _palette() -> Array:
 
 def _script(name: str, parts: bool) -> str:
     """A script or shader; lines between `//% if parts` and `//% endif` are only in pages of fields in parts."""
-    how = {f"{kind}_{end}_string": f"/*{sign}" if end == "start" else f"{sign}*/" for kind, sign in MARKS.items() for end in ("start", "end")}
-    environment = Environment(line_statement_prefix="//%", keep_trailing_newline=True, undefined=StrictUndefined, **how)
+    environment = Environment(
+        *("/*%", "%*/", "/*=", "=*/", "/*#", "#*/"),  # braces are the scripts' own
+        line_statement_prefix="//%",
+        keep_trailing_newline=True,
+        undefined=StrictUndefined,
+    )
     return environment.from_string(_source(name)).render(parts=parts)
 
 

@@ -61,7 +61,7 @@ def write_parts(folder: Path, field: BakedField, coarse: BakedField, ratio: int,
     Raises:
         OutputError: they cannot be written.
     """
-    parts = []
+    parts: list[dict[str, Any]] = []
     for slots, first, blocks in _runs(field, coarse, ratio, count):
         part = blocks_of(field, slots)
         arrays, blob = joined(corner_arrays(part))

@@ -178,8 +178,8 @@ def bake(field: Field, keep: torch.Tensor | None = None, like: BakedField | None
         thickness = np.exp(np.minimum(low_raw + step / FINER * np.arange(LEVELS * FINER + 1), RAW_MAX)) * UNITS
     else:
         low, scale, thickness = like.arrays.low, like.arrays.scale, like.arrays.thickness
-        low_raw, above = (np.log(max(thickness[at], np.finfo(np.float32).tiny) / UNITS) for at in (0, FINER))
-        step = max(above - low_raw, 1e-6)
+        low_raw, above = np.log(np.maximum(thickness[[0, FINER]], np.finfo(np.float32).tiny) / UNITS)
+        step = np.maximum(above - low_raw, 1e-6)
     packed, feature = np.empty(int(occupied.sum()), np.uint64), np.empty((total, values.shape[1]), np.uint8)
     done_voxels, done_corners, stored = 0, 0, stored_corners(rows)
     for start in range(0, len(occupied), CHUNK):
