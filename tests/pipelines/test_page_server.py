@@ -65,7 +65,7 @@ def test_the_page_and_its_parts_are_served(server: PageServer, path: str, text: 
 )
 def test_nothing_else_is(server: PageServer, path: str) -> None:
     status, got, _ = answer(server, path)
-    assert status == 404 and b"no" != got
+    assert status == 404 and got != b"no"
 
 
 def test_the_next_free_port_is_taken(tmp_path: Path) -> None:
