@@ -22,6 +22,7 @@ from fieldfuse.export.cameras import write_cameras
 from fieldfuse.export.crop import seen_part
 from fieldfuse.export.extras import require
 from fieldfuse.export.georeference import write_georeference
+from fieldfuse.export.parts import PARTS
 from fieldfuse.export.sparse import colours_in, points_of_field, stored_points
 from fieldfuse.export.surface import Originals, at_most, surface_of_field, whole_mesh
 from fieldfuse.export.undistorted import write_undistorted
@@ -117,7 +118,8 @@ def export_results(job: Job, ready: Prepared, fitted: Fitted, wish: Wish) -> dic
             facts["mesh"] = before["mesh"]
         if old is not None and not fits:
             made = {file.relative_to(job.folder.path).as_posix() for file in exported.files}
-            earlier = {Path(name).name for name in set(old.outputs) - made if name.startswith("exports/")} - {path.name}
+            left = [Path(name) for name in set(old.outputs) - made if name.startswith("exports/")]
+            earlier = {one.name for one in left if one.parent.name != PARTS} - {path.name}
             gone = sorted(earlier | (remove_old_splats(job) if splats is None else set()))
             of = "an earlier field" if same_part else "another crop"
             facts["notes"] += [REMOVED.format(of, ", ".join(gone), job.folder.path)] if gone else []
@@ -214,7 +216,7 @@ def put_shown(job: Job, ready: Prepared, fitted: Fitted, formats: set[str]) -> E
     shown = seen_part(fitted.field, ready.training.intrinsics, ready.training.world_from_camera, job.progress)
     if PAGE in formats:
         try:
-            out.files.append(put_page(job, folder / NAME, shown, views, scene))
+            out.files += put_page(job, folder / NAME, shown, views, scene)
             out.made.add(PAGE)
         except InputError as error:
             out.facts["notes"].append(f"the page to walk through was left out: {error}")

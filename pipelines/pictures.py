@@ -97,8 +97,9 @@ def baked_of(job: Job, field: Field, views: Views, scene: Scene) -> BakedField:
     return read_baked(place)
 
 
-def put_page(job: Job, path: Path, field: Field, views: Views, scene: Scene) -> Path:
-    """The baked field as a page that any browser walks through, with the places of all images (not the images) and a flight.
+def put_page(job: Job, path: Path, field: Field, views: Views, scene: Scene) -> list[Path]:
+    """The baked field as a page that any browser walks through, with the places of all images (not the images) and a flight; answers the
+    page and the files beside it that a large field has.
 
     Args:
         field: without what no training view sees (`crop.seen_part`).
@@ -124,8 +125,7 @@ def put_page(job: Job, path: Path, field: Field, views: Views, scene: Scene) -> 
         region=scene.surface_box(),
         inside=scene.layout == ROOM,
     )
-    write_page(path, bytes_, tour, job.source.name)
-    return path
+    return write_page(path, bytes_, tour, job.source.name, field.to("cpu"))
 
 
 def _start(field: Field, views: Views, scene: Scene) -> int:

@@ -54,6 +54,7 @@ SEES = {
     "full": "colours depend on the direction of view",
 }
 POSES = ("source", "registered", "total", "models", "missing", "seconds", "agreement", "metric", "scaling")
+OWN = {"facts.json", "index.json"}  # what only Fieldfuse reads: of the exports, and of a page's parts
 OPENED = {".html", ".ply", ".spz", ".obj", ".glb", ".usdz", ".las", ".laz", ".e57", ".mp4", ".txt", ".json"}
 NO_TEST_VIEWS = "no image was held out, so there are no scores; give --holdout 8 to keep every 8th image for testing"
 
@@ -139,7 +140,7 @@ def exported_files(job: Job) -> list[dict[str, Any]]:
         {"path": path, "bytes": size}
         for record in records
         for path, size in record.outputs.items()
-        if path.startswith(("exports/", "tsdf/", "mesh")) and Path(path).suffix in OPENED and not path.endswith("facts.json")
+        if path.startswith(("exports/", "tsdf/", "mesh")) and Path(path).suffix in OPENED and Path(path).name not in OWN
     ]
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from contextlib import ExitStack
 from typing import Annotated
 
 import typer
@@ -26,6 +27,7 @@ def view(
     from fieldfuse.pipelines.console import make_progress
     from fieldfuse.pipelines.fields import finished_field
     from fieldfuse.pipelines.job import open_job
+    from fieldfuse.pipelines.page_server import PageServer, has_parts
     from fieldfuse.pipelines.pictures import camera_of
     from fieldfuse.pipelines.prepare import prepare
     from fieldfuse.pipelines.stages import BEFORE
@@ -36,6 +38,11 @@ def view(
         ready = prepare(job)
         render = camera_of(job, finished_field(job, ready).field, ready.views, ready.scene, options.baked)
         shown = Shown(job.source.name, render, ready, place.folder / CAMERAS)
-    with Live(shown, host, port, image_size) as live:  # the run's folder is free again: others may work in it
+    exports = place.folder / "exports"
+    with ExitStack() as stack:  # the run's folder is free again: others may work in it
+        live = stack.enter_context(Live(shown, host, port, image_size))
         typer.echo(f"{live.address} shows the field; Ctrl-C ends it")
+        if has_parts(exports):
+            page = stack.enter_context(PageServer(exports, host, live.port + 1))
+            typer.echo(f"{page.address} is the page of its exports, with all details")
         live.wait()

@@ -106,7 +106,8 @@ class Live:
         warnings.filterwarnings("ignore", message="Queued a .* on a closed connection")  # a visitor left while a render was made
         with redirect_stdout(io.StringIO()):  # viser's own box with its addresses
             self.server = viser.ViserServer(host=host, port=port, label=f"Fieldfuse: {shown.name}", verbose=False)
-        self.address = f"http://{'localhost' if host in ('127.0.0.1', '0.0.0.0', '::') else host}:{self.server.get_port()}"
+        self.port = self.server.get_port()
+        self.address = f"http://{'localhost' if host in ('127.0.0.1', '0.0.0.0', '::') else host}:{self.port}"
         self._furnish()
         self.server.on_client_connect(self._welcome)
         self.server.on_client_disconnect(self._farewell)

@@ -211,3 +211,18 @@ def test_a_crop_holds_for_all_that_is_exported(out: Path, capsys: Capsys) -> Non
     assert answer.code == 2 and "nothing of the field lies in the region" in answer.sentence()
     answer = call(capsys, "export", out, "--crop", "bix", *AGAIN)
     assert answer.code == 2 and "did you mean" not in answer.sentence() and "x0,y0,z0,x1,y1,z1" in answer.sentence()
+
+
+def test_parts_of_a_large_field_are_the_runs_as_long_as_it_is_large(out: Path, capsys: Capsys, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("fieldfuse.export.page.MOST_BYTES", 0)
+    answer = call(capsys, "export", out, "--formats", "page", *AGAIN)
+    assert answer.code == 0, answer.err
+    parts = out / "exports" / "field_parts"
+    listed = {name for name in read_json(out / "stages" / "export.json")["outputs"] if "field_parts" in name}
+    assert len(listed) >= 2 and listed == {path.relative_to(out).as_posix() for path in parts.iterdir()}
+    assert [row["path"] for row in read_json(out / "report.json")["exports"] if "field" in row["path"]] == ["exports/field.html"]
+    monkeypatch.undo()
+    answer = call(capsys, "export", out, "--formats", "page", *AGAIN)
+    assert answer.code == 0 and not parts.exists() and (out / "exports" / "field.html").is_file()
+    assert not any(".bin" in text for text in json.loads(answer.out)["warnings"])
+    assert not [name for name in read_json(out / "stages" / "export.json")["outputs"] if "field_parts" in name]

@@ -81,14 +81,20 @@ def kept(out: Path) -> int:
 
 @pytest.fixture(scope="module")
 def served(tmp_path_factory: pytest.TempPathFactory) -> Iterator[tuple[Any, int, Path]]:
-    """The viewer of a small run at work, its port, and the run. In the end Ctrl-C ends it without a word."""
+    """The viewer of a small run at work, whose page has parts, its port, and the run. In the end Ctrl-C ends it without a word."""
     out = tmp_path_factory.mktemp("view") / "out"
     finished(out, 9, *FAST, "--quiet")
+    (out / "exports" / "field_parts").mkdir(parents=True)
+    for name in ("field.html", "field_parts/index.json"):
+        (out / "exports" / name).write_text(name)
     process = start("view", out, "--port", 0, "--image-size", max(CAMERA.width, CAMERA.height), "--threads", 1, "--quiet")
     try:
         assert process.stdout is not None
         line = process.stdout.readline()
         assert "http://localhost:" in line, process.communicate()[1]
+        page = process.stdout.readline().split()[0].replace("localhost", "127.0.0.1")
+        with urllib.request.urlopen(page.replace("field.html", "field_parts/index.json"), timeout=HUNG) as part:
+            assert page.endswith("/field.html") and part.read() == b"field_parts/index.json"
         yield process, int(line.split("http://localhost:")[1].split()[0]), out
         assert process.poll() is None  # visitors who leave end nothing
         process.send_signal(signal.SIGINT)

@@ -45,9 +45,11 @@ from fieldfuse.evaluation.tradeoff_page import write_tradeoff
 from fieldfuse.export.atlas import make_atlas
 from fieldfuse.export.cameras import write_cameras
 from fieldfuse.export.clouds import write_cloud
+from fieldfuse.export.coarse import coarsened
 from fieldfuse.export.georeference import write_georeference
 from fieldfuse.export.mesh import write_mesh
 from fieldfuse.export.page import Tour, write_page
+from fieldfuse.export.parts import write_parts
 from fieldfuse.export.ply import write_points
 from fieldfuse.export.undistorted import write_undistorted
 from fieldfuse.export.usd import write_usdz
@@ -191,6 +193,7 @@ def more_writers(place: Path) -> dict[str, Write]:
     return {
         "write_baked": lambda folder: write_baked(folder / "baked.safetensors", baked),
         "write_page": lambda folder: write_page(folder / "field.html", baked, tour, "page"),
+        "write_parts": lambda folder: write_parts(folder / "field_parts", baked, bake(coarsened(baked.to_field(), 2), like=baked), 2, 3),
         "save_model": lambda folder: save_model(folder / "weights.safetensors", model),
         "save_checkpoint": lambda folder: save_checkpoint(folder, TrainState(model, adam, step=3), {}, 2),
         "Curve.write": curve,

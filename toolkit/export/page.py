@@ -3,6 +3,8 @@
 The page holds only what cannot be worked out (occupied voxels, a byte of density and sixteen of features a corner as `corners.py` writes
 them, the decoder), deflated; the scripts in `web/` unpack it and march through it as `backends/numba/march.py` does. It asks no server
 for anything.
+
+A field that is too large for that is in the page on a coarser lattice, and in whole in `field_parts/` beside it (`parts.py`).
 """
 
 from __future__ import annotations
@@ -11,7 +13,6 @@ import base64
 import itertools
 import json
 import math
-import zlib
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from importlib import resources
@@ -25,11 +26,12 @@ from jinja2 import Environment, StrictUndefined
 from fieldfuse import __version__
 from fieldfuse.camera import Array, Intrinsics, Similarity
 from fieldfuse.errors import InputError
-from fieldfuse.export.corners import corner_differences, written_corners
+from fieldfuse.export.coarse import coarsened
+from fieldfuse.export.parts import PART_BYTES, PARTS, corner_arrays, deflated, joined, remove_others, write_parts
 from fieldfuse.files import atomic_path
 from fieldfuse.nerfusion.decoder import Deferred
 from fieldfuse.nerfusion.encoding import BEHIND, DIRECTION, SH
-from fieldfuse.render.bake import FINER, BakedField
+from fieldfuse.render.bake import FINER, BakedField, bake
 from fieldfuse.render.field import Field
 from fieldfuse.render.march import MAX_STRETCH
 from fieldfuse.tone import SHOULDER
@@ -37,6 +39,9 @@ from fieldfuse.tone import SHOULDER
 CHANNELS, HIDDEN = 16, 96  # at most: what lies in one word of four, and, in thirds, in uniform blocks of 16 kB
 WHOLE = 12  # hidden units are a multiple of it: three parts of rows, four units a vector
 INPUTS = CHANNELS + DIRECTION  # of the decoder: features and harmonics
+MOST_BYTES = 25_000_000  # of a field in its page: a page of 33 MB, which a phone opens in seconds and many a mailbox still takes
+COARSEST = 16  # by how much, at most, what is in the page is coarser than the field
+DETAIL_BYTES = 400_000_000  # of textures for details at a time: a phone's browser gives a page about a gigabyte in all
 NEAREST_DEPTH, FARTHEST_DEPTH = 0.6, 2.5  # of the median depth: the range of depth's colours
 SCRIPTS = ("unpack.js", "draw.js", "walk.js", "frame.js", "tools.js", "vr.js", "page.js")
 
@@ -87,66 +92,91 @@ def require_page(field: Field) -> None:
         )
 
 
-def write_page(path: Path | str, field: BakedField, tour: Tour, title: str) -> None:
-    """Write the page, atomically. `field` was baked from one that passed `require_page`.
+def write_page(path: Path | str, field: BakedField, tour: Tour, title: str, whole: Field | None = None) -> list[Path]:
+    """Write the page, atomically; where the field is too large for one file, a coarse one is in it, and the field is in `field_parts/`
+    beside it. Answers all files.
+
+    Args:
+        field: baked from one that passed `require_page`.
+        whole: what it was baked from, on the CPU; None: what its bytes stand for. Coarse ones are made of it.
 
     Raises:
-        OutputError: it cannot be written.
+        OutputError: a file cannot be written.
     """
-    text = page(field, tour, title)
+    path = Path(path)
+    files: list[Path] = []
+    about, blob = packed(field, tour)
+    inside = deflated(blob)
+    if len(inside) > MOST_BYTES:
+        count = -(-len(inside) // PART_BYTES)
+        coarse, ratio, about, inside = _coarse(field, field.to_field() if whole is None else whole, tour)
+        own, files = write_parts(path.parent / PARTS, field, coarse, ratio, count)
+        about |= {"parts": {"field": own, "ratio": ratio, "budget": DETAIL_BYTES}}
     with atomic_path(path) as temporary:
-        temporary.write_text(text, encoding="utf-8")
+        temporary.write_text(_text(about, inside, title, field.voxels), encoding="utf-8")
+    remove_others(path.parent / PARTS, files)
+    return [path, *files]
 
 
 def page(field: BakedField, tour: Tour, title: str) -> str:
-    """The page's text."""
-    environment = Environment(autoescape=True, undefined=StrictUndefined, trim_blocks=True)
+    """The text of the page with the whole field in it."""
     about, blob = packed(field, tour)
+    return _text(about, deflated(blob), title, field.voxels)
+
+
+def _coarse(field: BakedField, whole: Field, tour: Tour) -> tuple[BakedField, int, dict[str, Any], bytes]:
+    """The finest of the coarser fields that fits into a page, by how much it is coarser, and what `packed` and `deflated` make of it."""
+    ratio = 1
+    while True:
+        ratio *= 2
+        coarse = bake(coarsened(whole, ratio), like=field)
+        about, blob = packed(coarse, tour)
+        inside = deflated(blob)
+        if len(inside) <= MOST_BYTES or ratio == COARSEST:
+            break
+    about["march"]["voxel"] = ratio * 2 * field.space.extent / field.resolution
+    about["define"] |= {"RATIO": ratio, "COARSE_STEPS": field.fine, "FINE": "steps"}  # how many of them is a variable of the shader
+    return coarse, ratio, about, inside
+
+
+def _text(about: dict[str, Any], inside: bytes, title: str, voxels: int) -> str:
+    """The page around what `packed` and `deflated` answer."""
+    environment = Environment(autoescape=True, undefined=StrictUndefined, trim_blocks=True)
     # What closes a script would end it, wherever it stands.
     quoted = json.dumps(about, allow_nan=False, separators=(",", ":")).replace("<", "\\u003c")
-    raw = environment.filters["safe"]
+    raw, parts = environment.filters["safe"], "parts" in about
     return environment.from_string(_source("index.html.j2")).render(
         version=__version__,
         title=title,
-        photos=len(tour.names),
-        voxels=f"{field.voxels:,}",
-        unit="metres" if tour.metric else "units",
+        photos=len(about["photos"]),
+        voxels=f"{voxels:,}",
+        unit="metres" if about["metric"] else "units",
+        parts=parts,
         style=raw(_source("style.css")),
         about=raw(quoted),
-        march=raw(_source("march.frag")),
-        decode=raw(_source("decode.frag")),
-        field=raw(base64.b64encode(_deflated(blob)).decode("ascii")),
-        script=raw("\n".join(_source(name) for name in SCRIPTS)),
+        march=raw(_script("march.frag", parts)),
+        decode=raw(_script("decode.frag", parts)),
+        field=raw(base64.b64encode(inside).decode("ascii")),
+        script=raw("\n".join(_script(name, parts) for name in (SCRIPTS if not parts else (*SCRIPTS[:-1], "parts.js", SCRIPTS[-1])))),
     )
 
 
 def packed(field: BakedField, tour: Tour) -> tuple[dict[str, Any], bytes]:
-    """What the scripts need to know, and the arrays one after the other, each filled up to whole words."""
-    arrays = field.arrays
+    """What the scripts need to know, and the arrays one after the other."""
     small, large = decoder_blocks(field)
+    bits, keys, values = corner_arrays(field)
     given: list[tuple[str, Array]] = [
-        ("bits", np.ascontiguousarray(arrays.bits).view(np.uint8)),
-        ("keys", (field.keys() - field.table_origin).astype(np.uint16)),
-        ("bricks", arrays.bricks),
-        ("values", corner_differences(field, written_corners(field))),
-        ("thickness", arrays.thickness.astype("<f4")),
+        bits,
+        keys,
+        ("bricks", field.arrays.bricks),
+        values,
+        ("thickness", field.arrays.thickness.astype("<f4")),
         ("small", small.astype("<f4")),
         ("large", large.astype("<f4")),
         ("palette", _palette()),
     ]
-    blob = bytearray()
-    for _, array in given:
-        blob += array.tobytes()
-        blob += b"\0" * (-len(blob) % 4)
-    about = _about(field, tour)
-    about["arrays"] = [[name, f"{array.dtype.kind}{array.dtype.itemsize}", array.size] for name, array in given]
-    return about, bytes(blob)
-
-
-def _deflated(blob: bytes) -> bytes:
-    """Differences hardly repeat: their frequencies are all that helps, and runs in what else there is."""
-    how = zlib.compressobj(strategy=zlib.Z_RLE)
-    return how.compress(blob) + how.flush()
+    arrays, blob = joined(given)
+    return {**_about(field, tour), "arrays": arrays}, blob
 
 
 def _width(field: BakedField) -> int:
@@ -245,6 +275,17 @@ def _palette() -> Array:
     """(256, 4) uint8: depth's colours from far (red) to near (blue), as in the report."""
     colours = cv2.applyColorMap(np.arange(256, dtype=np.uint8)[::-1, None], cv2.COLORMAP_TURBO)[:, 0, ::-1]
     return np.concatenate([colours, np.full((256, 1), 255, np.uint8)], 1)
+
+
+def _script(name: str, parts: bool) -> str:
+    """A script or shader; lines between `//% if parts` and `//% endif` are only in pages of fields in parts."""
+    environment = Environment(
+        *("/*%", "%*/", "/*=", "=*/", "/*#", "#*/"),  # braces are the scripts' own
+        line_statement_prefix="//%",
+        keep_trailing_newline=True,
+        undefined=StrictUndefined,
+    )
+    return environment.from_string(_source(name)).render(parts=parts)
 
 
 def _source(name: str) -> str:

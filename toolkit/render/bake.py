@@ -150,11 +150,12 @@ def stored_corners(rows: Array) -> Array:
     return (rows[:, :, None] >> np.arange(CORNERS) & 1).astype(bool).reshape(len(rows), -1)
 
 
-def bake(field: Field, keep: torch.Tensor | None = None) -> BakedField:
+def bake(field: Field, keep: torch.Tensor | None = None, like: BakedField | None = None) -> BakedField:
     """Quantise a field: eight bits a feature and a corner's raw density, only what lies beside occupied voxels.
 
     Args:
         keep: (M · 512,) bool, the voxels that stay (see `seen_voxels`); None: all that are occupied.
+        like: a baked field whose bytes are to mean the same as the new one's; None: the range of each value is taken from `field`.
 
     Raises:
         InputError: the decoder is not the deferred one, or nothing is left.
@@ -170,9 +171,15 @@ def bake(field: Field, keep: torch.Tensor | None = None) -> BakedField:
     occupied = occupied[: int(occupied.any(1).sum())]  # the blocks behind them only lend corners
     first, rows, base, total = counted(occupied)
     raw, values = field.density_rows.detach().numpy(), field.feature_rows.detach().numpy()
-    used = np.flatnonzero(corner_nodes(topology, field.occupied).numpy())
-    used = used[:: max(1, len(used) // MOST_CORNERS)]
-    (low_raw, low), (step, scale) = zip(_range(raw[used, None]), _range(values[used]), strict=True)
+    if like is None:
+        used = np.flatnonzero(corner_nodes(topology, field.occupied).numpy())
+        used = used[:: max(1, len(used) // MOST_CORNERS)]
+        (low_raw, low), (step, scale) = zip(_range(raw[used, None]), _range(values[used]), strict=True)
+        thickness = np.exp(np.minimum(low_raw + step / FINER * np.arange(LEVELS * FINER + 1), RAW_MAX)) * UNITS
+    else:
+        low, scale, thickness = like.arrays.low, like.arrays.scale, like.arrays.thickness
+        low_raw, above = np.log(np.maximum(thickness[[0, FINER]], np.finfo(np.float32).tiny) / UNITS)
+        step = np.maximum(above - low_raw, 1e-6)
     packed, feature = np.empty(int(occupied.sum()), np.uint64), np.empty((total, values.shape[1]), np.uint8)
     done_voxels, done_corners, stored = 0, 0, stored_corners(rows)
     for start in range(0, len(occupied), CHUNK):
@@ -185,7 +192,6 @@ def bake(field: Field, keep: torch.Tensor | None = None) -> BakedField:
         eight = [levels[:, z : z + 8, y : y + 8, x : x + 8].reshape(-1, VOXELS)[part] for z in (0, 1) for y in (0, 1) for x in (0, 1)]
         packed[done_voxels : done_voxels + len(eight[0])] = np.stack(eight, 1).view("<u8").reshape(-1)
         done_voxels += len(eight[0])
-    thickness = np.exp(np.minimum(low_raw + step / FINER * np.arange(LEVELS * FINER + 1), RAW_MAX)) * UNITS
     bricks = np.where(field.grid.bricks.numpy() > 0, np.uint8(0), np.uint8(FARTHEST))
     chessboard_distance(bricks, FARTHEST)
     table = topology.table.numpy()

@@ -8,6 +8,9 @@ uniform highp usampler2D densities;  // a voxel: the quantised raw densities of 
 uniform highp usampler2D rows;       // a row of a block's corners: which are stored, how many are before it
 uniform highp usampler2D features;   // a corner: sixteen bytes
 uniform highp sampler2D thickness;   // by raw density in sixteenths of its steps
+//% if parts
+uniform highp isampler2D children;  // of a block: its RATIO³ blocks of the finer lattice, -1: not loaded, -2: nothing is there
+//% endif
 uniform vec3 centre, box, place;
 uniform ivec3 tableOrigin;
 uniform float halfSize, shell, extent, voxel, near;
@@ -59,6 +62,20 @@ void colour(inout vec4 mean[4], int slot, ivec3 cell, vec3 f, float weight) {
   }
 }
 
+//% if parts
+// The block of a lattice RATIO times as fine, or the coarse one where that is not loaded, and by how much it is finer than this lattice;
+// -1 where nothing is.
+ivec2 blockAt(ivec3 fine) {
+  ivec3 whole = fine / RATIO - tableOrigin, own = fine & RATIO - 1;
+  bool inside = all(greaterThanEqual(whole, ivec3(0))) && all(lessThan(whole, textureSize(blocks, 0)));
+  int slot = inside ? texelFetch(blocks, whole, 0).x : -1;
+  if (slot < 0) return ivec2(-1, RATIO);
+  int child = texelFetch(children, at(((slot * RATIO + own.z) * RATIO + own.y) * RATIO + own.x), 0).x;
+  return child == -1 ? ivec2(slot, 1) : ivec2(child, RATIO);
+}
+
+ivec3 fineBlock(vec3 p) { return ivec3(clamp(p / voxel, vec3(0), vec3(float(RESOLUTION) - 1e-3)) * float(RATIO)) >> 3; }
+//% endif
 // Where a ray enters a box of half size `box` about zero, and where it leaves it.
 vec2 through(vec3 o, vec3 d, vec3 box) {
   vec3 way = mix(d, vec3(1e-9), lessThan(abs(d), vec3(1e-9)));
@@ -91,6 +108,9 @@ void main() {
   ivec3 last = ivec3(-1), tableSize = textureSize(blocks, 0);
   int slot = -1, top = textureSize(bricks, 0).x - 1;
   bool known = false;
+  //% if parts
+  float finer = 1.0;
+  //% endif
   vec3 p0 = vec3(0);
   for (int turnOf = 0; turnOf < LONGEST; turnOf++) {
     vec3 y = o + s * d;
@@ -121,15 +141,30 @@ void main() {
     }
     if (s1 > start) {
       vec3 way = p1 - p0;
+      //% if parts
+      int steps = COARSE_STEPS * max(blockAt(fineBlock(p0)).y, blockAt(fineBlock(p1)).y);
+      //% endif
       float length_ = length(way) / float(FINE);
       for (int i = 0; i < FINE; i++) {
         vec3 x = clamp((p0 + way * ((float(i) + 0.5) / float(FINE))) / voxel, vec3(0), vec3(most));
+        //% if parts
+        ivec3 block = ivec3(x * float(RATIO)) >> 3;
+        if (block != last) {
+          last = block;
+          ivec2 found = blockAt(block);
+          slot = found.x;
+          finer = float(found.y);
+        }
+        x *= finer;
+        ivec3 cell = ivec3(x);
+        //% else
         ivec3 cell = ivec3(x), block = (cell >> 3) - tableOrigin;
         if (block != last) {
           last = block;
           bool inside = all(greaterThanEqual(block, ivec3(0))) && all(lessThan(block, tableSize));
           slot = inside ? texelFetch(blocks, block, 0).x : -1;
         }
+        //% endif
         if (slot < 0) continue;
         ivec3 own = cell & 7;
         uvec4 slice = texelFetch(slices, at(slot * 8 + own.z), 0);

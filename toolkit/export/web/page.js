@@ -140,6 +140,9 @@ class Page {
 
   draw(target, from, to, view = this.view(target.width, target.height)) {
     const begin = performance.now();
+    //% if parts
+    this.seen = view;
+    //% endif
     this.field.strip(target, view, from, to);
     this.field.told(target, 0, from);  // waits
     const took = (performance.now() - begin) / (target.width * (to - from));
@@ -335,6 +338,9 @@ async function begin() {
   const shaders = {march: $('march').textContent, decode: $('decode').textContent};
   window.fieldfuse = new Page(about, new Field(gl, about, shaders, data), gl);
   tell('');
+  //% if parts
+  window.fieldfuse.details = new Details(window.fieldfuse, data);
+  //% endif
 }
 
 begin().catch(error => tell(error.message));
