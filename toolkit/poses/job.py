@@ -66,6 +66,8 @@ class Job:
     features: str = SIFT
     tolerance: float = TOLERANCE  # pixels that a match may be off its epipolar line, and a point off where it is seen
     second: str | None = None  # features that are tried where the first place too few
+    address: str | None = None  # of a Ray cluster whose nodes find features and match, too
+    feature_bytes: int = 0  # memory that finding the features of one image takes
 
     @property
     def database(self) -> Path:

@@ -37,6 +37,7 @@ def find_poses(
     seed: int = 0,
     threads: int | None = None,
     progress: Progress = SILENT,
+    address: str | None = None,
 ) -> PoseResult:
     """Structure from motion over the capture's images; poses and intrinsics that it brings are not used.
 
@@ -44,9 +45,12 @@ def find_poses(
     settings are the same. With the same seed the result repeats; up to `job.REPEATABLE` images that of the incremental
     mapper does bit for bit, whatever the threads. A capture with depth maps gets the depth's scale.
 
+    Args:
+        address: of a Ray cluster that finds features and matches where these are many: "auto" or HOST:PORT.
+
     Raises:
         PoseError: no usable poses, and why; or the child process crashed.
-        InputError: an image cannot be read, or there is too little memory.
+        InputError: an image cannot be read, there is too little memory, or the cluster cannot be used.
         Interrupted: the user asked to stop.
     """
     settings = settings or PosesSettings()
@@ -62,6 +66,7 @@ def find_poses(
     )
     first, second, notes = _features(settings.features)
     job = plan(capture, Path(out).resolve() / "sparse", settings, seed, workers, first, second)
+    job = replace(job, address=address, feature_bytes=SIFT_BYTES * pixels)
     seconds: dict[str, float] = {}
     began = time.monotonic()
     facts = _run(job, seconds, progress)
