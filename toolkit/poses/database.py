@@ -41,7 +41,7 @@ LEAST_MOVING = 12  # matches that move, and that one epipolar geometry must expl
 STRAIGHT = 0.75  # share of them that go away from one point where the camera did not turn
 
 IMAGES_A_TASK = 16  # whose features one task on a cluster finds
-IMAGES_WORTH = 64  # from which starting it is worth it (docs/measured/performance.md)
+IMAGES_WORTH = 50  # for each thread of this machine, from which the cluster is worth its start (docs/cluster.md)
 
 Report = Callable[[float, float, str], None]
 Found = tuple[dict[str, Any], Array, Array]  # record, keypoints, descriptors of an image
@@ -114,7 +114,8 @@ def learned(grey: Array, most: int) -> tuple[Array, Array]:
     from fieldfuse.poses import xfeat  # torch takes a second and 200 MB, and is not always needed
 
     network = xfeat.installed()
-    assert network is not None  # a job with these features is made only where the weights are
+    if network is None:  # on a node: a job with these features is made only where the weights are
+        raise InputError(f"XFeat's weights are not installed there; {xfeat.INSTALL}")
     keypoints, descriptors = xfeat.detect(network, grey, most)
     return keypoints, descriptors.astype(np.float16).view(np.uint8)
 
@@ -154,7 +155,7 @@ def extract(job: Job, database: pycolmap.Database, report: Report) -> list[dict[
 
 def _features(job: Job, indices: list[int], report: Report) -> Iterator[tuple[int, Found]]:
     """Features of the images at `indices`, in order: of the job's cluster, where there is one and it helps, or a few ahead."""
-    if job.address is not None and len(indices) >= IMAGES_WORTH:
+    if job.address is not None and len(indices) >= IMAGES_WORTH * job.threads:
         places = _spread(job, indices, report)
         for path in places:
             yield from _read_features(path)

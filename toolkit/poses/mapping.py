@@ -6,7 +6,9 @@ Runs in the child process only.
 from __future__ import annotations
 
 import shutil
-from collections.abc import Callable
+import threading
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -18,13 +20,15 @@ from fieldfuse.camera import OPENCV, Intrinsics
 from fieldfuse.errors import PoseError
 from fieldfuse.files import remove
 from fieldfuse.poses.database import MIN_INLIERS, Report, keypoints_of, opened
-from fieldfuse.poses.job import GLOBAL, GONE_FAR, GONE_ON, LOOSE, TOLERANCE, Job
+from fieldfuse.poses.job import GLOBAL, GONE_FAR, GONE_ON, IN_PARTS, LOOSE, PART, STRICT, TOLERANCE, Job
 from fieldfuse.poses.points import epipolar_distance
 
-STRICT = "incremental"  # the attempt by COLMAP's own rules
 SMALL_ANGLE, TINY_ANGLE = 1.0, 0.25  # degrees between rays that a point needs in a looser attempt, and in the last that adds images
 LEFT_OUT, LEFT_OUT_SHARE = 3, 0.02  # images without a place, and share of all, that are worth that last one
 WORSE = 1.25  # times the error of the strict model that a model which went on from it may have
+LARGE = 2000  # images beyond which parts of them are mapped first: one after the other gets slower with each
+SHARED = 100  # images that a part of them shares with the next
+PARTS_ENOUGH = 0.9  # share of registered images below which such a model is not used, and all are mapped in one piece
 ENOUGH = 0.6  # share of registered images below which a looser attempt is worth its time
 FEW_POINTS = 12  # an image that sees fewer of the model's points hangs in the air: not registered
 SMALLEST = 3  # registered images that make a model
@@ -32,6 +36,7 @@ MAX_ERROR = 3.0  # pixels; the mean reprojection error of a model that can be tr
 ADJUSTED_AFTER = 1.4  # times the images or points of the last time, after which all are adjusted again
 STEP_TOLERANCE = 1e-5  # share of the error by which an adjustment has to get better to go on, while mapping …
 LAST_TOLERANCE, LAST_STEPS = 1e-9, 30  # … and at the end; a point that flees to infinity would go on for ever
+REPEATED = 60.0  # seconds between two reports of the same
 ANGLE_SAMPLE = 2000  # points looked at for the triangulation angle
 
 
@@ -57,6 +62,7 @@ def map_images(job: Job, report: Report) -> tuple[Model | None, list[dict[str, A
     """The largest trustworthy model in a settled frame, and what every attempt gave: `{"attempt", "models": [frames, …]}`, largest
     first."""
     attempts: list[tuple[str, Callable[[], list[pycolmap.Reconstruction]]]] = [
+        (IN_PARTS, lambda: _in_parts(job, report) if len(job.images) > LARGE and not job.rigged else []),
         (STRICT, lambda: _incremental(job, report)),
         (GONE_ON, lambda: [] if best is None else _incremental(job, report, SMALL_ANGLE, best.reconstruction)),
         (GONE_FAR, lambda: [] if best is None else _incremental(job, report, TINY_ANGLE, best.reconstruction)),
@@ -70,6 +76,8 @@ def map_images(job: Job, report: Report) -> tuple[Model | None, list[dict[str, A
             continue
         models = sorted((Model(found, name, _registered(found)) for found in attempt()), key=lambda model: model.size, reverse=True)
         models = [model for model in models if len(model.registered) >= SMALLEST]
+        if name == IN_PARTS and not models:
+            continue
         history.append({"attempt": name, "models": [len(model.registered) for model in models]})
         for model in models:
             if model.error <= MAX_ERROR * max(1.0, job.tolerance / TOLERANCE) and (best is None or _better(model, best)):
@@ -98,6 +106,8 @@ def _enough(attempt: str, images: int) -> float:
     """Registered images from which an attempt is not worth its time."""
     if attempt == GONE_ON:
         return images
+    if attempt == STRICT:
+        return PARTS_ENOUGH * images
     if attempt == GONE_FAR:
         return images - many(images) + 0.5
     return ENOUGH * images
@@ -194,8 +204,45 @@ def _incremental(
     return list(found.values())
 
 
+def _in_parts(job: Job, report: Report) -> list[pycolmap.Reconstruction]:
+    """The models of `PART` images each, which several threads make by COLMAP's own rules, put together; the largest is adjusted, since
+    parts are joined by nothing but a similarity."""
+    options = pycolmap.HierarchicalPipelineOptions()
+    options.incremental_options = _options(job)
+    options.num_threads = options.num_workers = job.threads
+    options.clustering_options.leaf_max_num_images = PART
+    options.clustering_options.image_overlap = SHARED
+    pycolmap.set_random_seed(job.seed)
+    folder = _empty(Path(job.folder) / "attempt")
+    with _again_and_again(report, len(job.images), f"mapping in parts of {PART} images"):
+        found = list(pycolmap.hierarchical_mapping(job.database, folder, folder, options).values())
+        models = [Model(one, IN_PARTS, _registered(one)) for one in found]
+        best = max(models, key=lambda model: model.size, default=None)
+        if best is not None and len(best.registered) >= SMALLEST:
+            finish(job, best, report)
+    return found
+
+
+@contextmanager
+def _again_and_again(report: Report, total: int, note: str) -> Iterator[None]:
+    """Repeat a report while COLMAP, which is silent here, is at work: a child process that says nothing for long counts as hung."""
+    done = threading.Event()
+
+    def repeat() -> None:
+        while not done.wait(REPEATED):
+            report(0, total, note)
+
+    report(0, total, note)
+    thread = threading.Thread(target=repeat, daemon=True)
+    thread.start()
+    try:
+        yield
+    finally:
+        done.set()
+        thread.join()
+
+
 def _global(job: Job, report: Report) -> list[pycolmap.Reconstruction]:
-    report(0, len(job.images), "mapping all at once")
     # Calibrating the view graph rewrites cameras and pairs: on a copy, so that a re-run starts from the same matches.
     copy = Path(job.folder) / "global.db"
     remove(copy)
@@ -207,7 +254,8 @@ def _global(job: Job, report: Report) -> list[pycolmap.Reconstruction]:
         options.num_threads = job.threads
         options.random_seed = job.seed
         folder = _empty(Path(job.folder) / "attempt")
-        return list(pycolmap.global_mapping(copy, folder, folder, options).values())
+        with _again_and_again(report, len(job.images), "mapping all at once"):
+            return list(pycolmap.global_mapping(copy, folder, folder, options).values())
     finally:
         remove(copy)
 
@@ -240,7 +288,7 @@ def finish(job: Job, model: Model, report: Report) -> None:
     options.ceres.solver_options.num_threads = job.repeating
     pycolmap.bundle_adjustment(model.reconstruction, options)
     # As after each of the mapper's own: a point that hardly any parallax held may have gone behind a camera, or to where numbers end.
-    rules = _options(job, None if model.attempt == STRICT else TINY_ANGLE if model.attempt == GONE_FAR else SMALL_ANGLE).mapper
+    rules = _options(job, None if model.attempt in (STRICT, IN_PARTS) else TINY_ANGLE if model.attempt == GONE_FAR else SMALL_ANGLE).mapper
     pycolmap.ObservationManager(model.reconstruction).filter_all_points3D(rules.filter_max_reproj_error, rules.filter_min_tri_angle)
     model.registered = _registered(model.reconstruction)
     settle(model)

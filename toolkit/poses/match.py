@@ -33,7 +33,7 @@ PAIRS_A_STEP = 40  # matched between two progress reports
 MOST_MATCHERS = 8  # processes, each of a hundred megabytes and more
 MOST_DESCRIBED = 128  # images whose learned descriptors are held in memory, of a megabyte each
 PAIRS_A_TASK = 200  # matched by one task on a cluster
-PAIRS_WORTH = 400  # from which starting it is worth it (docs/measured/performance.md)
+PAIRS_WORTH = 200  # for each process of this machine, from which the cluster is worth its start (docs/cluster.md)
 MOST_COPIED = 2**30  # bytes of all copies of the database, of which each process that matches has one
 
 
@@ -51,7 +51,7 @@ def match(job: Job, pairs: list[tuple[int, int]], report: Report) -> None:
         before = 0.5 if job.features == XFEAT else 0.0
         report(before * total + (1 - before) * done, total, f"matching, pair {done} of {total}")
 
-    if job.address is not None and total >= PAIRS_WORTH:
+    if job.address is not None and total >= PAIRS_WORTH * _processes(job):
         _spread(job, pairs, left, report)
         left = _left(job, left)
     if job.features == XFEAT and left:
@@ -83,7 +83,7 @@ def _spread(job: Job, pairs: list[tuple[int, int]], left: list[tuple[int, int]],
         report(pair, len(left), f"matching, pair {pair} of {len(left)}, on the cluster's nodes")
 
     show(0)
-    if spread(job, matches_of, tasks, show, min(job.threads, MOST_MATCHERS)):
+    if spread(job, matches_of, tasks, show, _processes(job)):
         for task, part in zip(tasks, parts, strict=True):  # not before all are done: tasks read the database
             _bring(Path(task.argument[-1]), job.database, part)
     remove(folder)
@@ -149,6 +149,11 @@ def _compare(job: Job, pairs: list[tuple[int, int]], show: Callable[[int], None]
                         database.write_matches(ids[i], ids[j], matches)
 
 
+def _processes(job: Job) -> int:
+    """That match on this machine at the same time."""
+    return min(job.threads, MOST_MATCHERS)
+
+
 def _steps(pairs: list[tuple[int, int]]) -> list[list[tuple[int, int]]]:
     """Pairs that are matched between two progress reports."""
     return [pairs[start : start + PAIRS_A_STEP] for start in range(0, len(pairs), PAIRS_A_STEP)]
@@ -159,7 +164,7 @@ def _together(job: Job, pairs: list[tuple[int, int]], show: Callable[[int], None
     them failed; what the others did stays."""
     steps, done, lock = _steps(pairs), 0, threading.Lock()
     free: SimpleQueue[Path] = SimpleQueue()
-    with _copies(job, min(job.threads, MOST_MATCHERS, len(steps))) as folders:
+    with _copies(job, min(_processes(job), len(steps))) as folders:
         if len(folders) < 2:
             return
         for folder in folders:
