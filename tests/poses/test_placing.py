@@ -17,9 +17,8 @@ from fieldfuse.capture import open_capture
 from fieldfuse.config import PosesSettings
 from fieldfuse.poses import database as store
 from fieldfuse.poses import mapping, worker
-from fieldfuse.poses.database import Report
 from fieldfuse.poses.health import doubts
-from fieldfuse.poses.job import MAX_ASKED_AGAIN, MAX_EXHAUSTIVE, Job
+from fieldfuse.poses.job import IN_PARTS, MAX_ASKED_AGAIN, MAX_EXHAUSTIVE, STRICT, Job
 from fieldfuse.poses.mapping import agreement, leave_out, plain
 from fieldfuse.poses.pairs import choose_pairs, pairs_with, sequential_pairs
 from fieldfuse.poses.points import epipolar_distance
@@ -157,7 +156,7 @@ def job(tmp_path_factory) -> Job:
 @pytest.fixture
 def model(job) -> mapping.Model:
     model, attempts = mapping.map_images(job, silent)
-    assert model is not None and attempts == [{"attempt": mapping.STRICT, "models": [8]}]
+    assert model is not None and attempts == [{"attempt": STRICT, "models": [8]}]
     return model
 
 
@@ -206,7 +205,7 @@ def test_many_images_are_mapped_in_parts(many, monkeypatch):
     monkeypatch.setattr(mapping, "REPEATED", 0.01)
     notes: list[str] = []
     model, attempts = mapping.map_images(job, lambda done, total, note: notes.append(note))
-    assert [attempt["attempt"] for attempt in attempts] == [mapping.IN_PARTS]
+    assert [attempt["attempt"] for attempt in attempts] == [IN_PARTS]
     assert model is not None and len(model.registered) == 16 and model.error < 1.0
     assert centre_error(model, poses) < 0.01
     assert notes.count("mapping in parts of 9 images") > 5
@@ -225,5 +224,5 @@ def test_parts_that_leave_too_many_out_are_not_used(many, monkeypatch):
 
     monkeypatch.setattr(mapping, "_in_parts", part)
     model, attempts = mapping.map_images(job, silent)
-    assert attempts == [{"attempt": mapping.IN_PARTS, "models": [12]}, {"attempt": mapping.STRICT, "models": [16]}]
-    assert model is not None and model.attempt == mapping.STRICT
+    assert attempts == [{"attempt": IN_PARTS, "models": [12]}, {"attempt": STRICT, "models": [16]}]
+    assert model is not None and model.attempt == STRICT
