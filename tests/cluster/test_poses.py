@@ -135,7 +135,8 @@ def test_what_is_not_faster_elsewhere_is_matched_here(
     monkeypatch.setattr(match, "matches_of", lambda *_: pytest.fail("a task was begun"))
     if case == "few pairs":
         monkeypatch.setattr(match, "PAIRS_WORTH", len(PAIRS) + 1)
-    job = copied(featured, tmp_path / "job", "auto", threads=0 if case == "few pairs" else 1)
+        monkeypatch.setattr("fieldfuse.poses.spread.open_workers", lambda _: pytest.fail("the cluster was asked"))
+    job = copied(featured, tmp_path / "job", "auto")
     match.match(job, PAIRS, silent)
     assert content(job) == alone and not (tmp_path / "job" / FOLDER).exists()
 
