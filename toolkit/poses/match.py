@@ -104,8 +104,10 @@ def matches_of(argument: tuple[str, list[tuple[int, int]], str], link: Progress)
         for done, step in enumerate(_steps(pairs)):
             link.update(done * PAIRS_A_STEP, len(pairs))
             _match(own, Path(folder), step)
+        found = Path(folder) / target.name  # SQLite writes where its locks work
+        _excerpt(own.database, found, [])
         with atomic_path(target) as path:
-            _excerpt(own.database, path, [])
+            shutil.copyfile(found, path)
 
 
 def _excerpt(source: Path, target: Path, pairs: list[tuple[int, int]]) -> None:
