@@ -15,8 +15,8 @@ from scipy.spatial.transform import Rotation
 
 from fieldfuse.capture import open_capture
 from fieldfuse.config import PosesSettings
+from fieldfuse.poses import child, mapping, worker
 from fieldfuse.poses import database as store
-from fieldfuse.poses import mapping, worker
 from fieldfuse.poses.health import doubts
 from fieldfuse.poses.job import IN_PARTS, MAX_ASKED_AGAIN, MAX_EXHAUSTIVE, STRICT, Job
 from fieldfuse.poses.mapping import agreement, leave_out, plain
@@ -202,7 +202,7 @@ def test_many_images_are_mapped_in_parts(many, monkeypatch):
     monkeypatch.setattr(mapping, "LARGE", 15)
     monkeypatch.setattr(mapping, "PART", 9)
     monkeypatch.setattr(mapping, "SHARED", 6)
-    monkeypatch.setattr(mapping, "REPEATED", 0.01)
+    monkeypatch.setattr(child, "REPEATED", 0.01)
     notes: list[str] = []
     model, attempts = mapping.map_images(job, lambda done, total, note: notes.append(note))
     assert [attempt["attempt"] for attempt in attempts] == [IN_PARTS]

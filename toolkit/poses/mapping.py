@@ -6,9 +6,7 @@ Runs in the child process only.
 from __future__ import annotations
 
 import shutil
-import threading
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -19,6 +17,7 @@ import pycolmap
 from fieldfuse.camera import OPENCV, Intrinsics
 from fieldfuse.errors import PoseError
 from fieldfuse.files import remove
+from fieldfuse.poses.child import alive
 from fieldfuse.poses.database import MIN_INLIERS, Report, keypoints_of, opened
 from fieldfuse.poses.job import GLOBAL, GONE_FAR, GONE_ON, IN_PARTS, LOOSE, PART, STRICT, TOLERANCE, Job
 from fieldfuse.poses.points import epipolar_distance
@@ -36,7 +35,6 @@ MAX_ERROR = 3.0  # pixels; the mean reprojection error of a model that can be tr
 ADJUSTED_AFTER = 1.4  # times the images or points of the last time, after which all are adjusted again
 STEP_TOLERANCE = 1e-5  # share of the error by which an adjustment has to get better to go on, while mapping …
 LAST_TOLERANCE, LAST_STEPS = 1e-9, 30  # … and at the end; a point that flees to infinity would go on for ever
-REPEATED = 60.0  # seconds between two reports of the same
 ANGLE_SAMPLE = 2000  # points looked at for the triangulation angle
 
 
@@ -214,32 +212,13 @@ def _in_parts(job: Job, report: Report) -> list[pycolmap.Reconstruction]:
     options.clustering_options.image_overlap = SHARED
     pycolmap.set_random_seed(job.seed)
     folder = _empty(Path(job.folder) / "attempt")
-    with _again_and_again(report, len(job.images), f"mapping in parts of {PART} images"):
+    with alive(lambda: report(0, len(job.images), f"mapping in parts of {PART} images")):
         found = list(pycolmap.hierarchical_mapping(job.database, folder, folder, options).values())
         models = [Model(one, IN_PARTS, _registered(one)) for one in found]
         best = max(models, key=lambda model: model.size, default=None)
         if best is not None and len(best.registered) >= SMALLEST:
             finish(job, best, report)
     return found
-
-
-@contextmanager
-def _again_and_again(report: Report, total: int, note: str) -> Iterator[None]:
-    """Repeat a report while COLMAP, which is silent here, is at work: a child process that says nothing for long counts as hung."""
-    done = threading.Event()
-
-    def repeat() -> None:
-        while not done.wait(REPEATED):
-            report(0, total, note)
-
-    report(0, total, note)
-    thread = threading.Thread(target=repeat, daemon=True)
-    thread.start()
-    try:
-        yield
-    finally:
-        done.set()
-        thread.join()
 
 
 def _global(job: Job, report: Report) -> list[pycolmap.Reconstruction]:
@@ -254,7 +233,7 @@ def _global(job: Job, report: Report) -> list[pycolmap.Reconstruction]:
         options.num_threads = job.threads
         options.random_seed = job.seed
         folder = _empty(Path(job.folder) / "attempt")
-        with _again_and_again(report, len(job.images), "mapping all at once"):
+        with alive(lambda: report(0, len(job.images), "mapping all at once")):
             return list(pycolmap.global_mapping(copy, folder, folder, options).values())
     finally:
         remove(copy)

@@ -12,6 +12,7 @@ from pathlib import Path
 from fieldfuse.cluster import Task, open_workers
 from fieldfuse.cluster.tasks import Function
 from fieldfuse.errors import FieldfuseError
+from fieldfuse.poses.child import alive
 from fieldfuse.poses.job import Job
 
 FOLDER = "tasks"  # in the job's, until what it holds is in the database
@@ -38,7 +39,15 @@ def spread(job: Job, function: Function, tasks: Sequence[Task], show: Callable[[
         if workers.at_once(left[0]) <= alone:
             return False
         workers.check(Path(job.folder), sorted({image.image for image in (job.images[0], job.images[-1])}))
-        failed = workers.finish(function, left, lambda done: show(len(tasks) - len(left) + done))
+        said = 0.0
+
+        def listen(done: float) -> None:
+            nonlocal said
+            said = done
+            show(len(tasks) - len(left) + done)
+
+        with alive(lambda: listen(said)):  # tasks may wait long for others' to end
+            failed = workers.finish(function, left, listen)
     if failed:
         raise FieldfuseError(f"{failed[0]}; {len(tasks) - len(failed)} of {len(tasks)} tasks are kept, run the same command again")
     return True
