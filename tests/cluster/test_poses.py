@@ -8,6 +8,7 @@ from collections.abc import Iterator
 from contextlib import AbstractContextManager, closing
 from dataclasses import replace
 from pathlib import Path
+from tempfile import gettempdir
 from typing import Any
 
 import numpy as np
@@ -102,6 +103,7 @@ def test_a_node_that_dies_while_it_matches_costs_nothing_else(cluster: Any, feat
 
     match.match(job, PAIRS, kill)
     assert killed and content(job) == alone
+    assert not list(Path(gettempdir()).glob(f"fieldfuse-matching-*-{killed[0]}"))
 
 
 @pytest.mark.usefixtures("here")

@@ -14,8 +14,10 @@ from functools import lru_cache
 from multiprocessing import get_context, parent_process
 from pathlib import Path
 from queue import SimpleQueue
-from tempfile import TemporaryDirectory
+from socket import gethostname
+from tempfile import gettempdir
 
+import psutil
 import pycolmap
 
 from fieldfuse.camera import Array
@@ -96,18 +98,34 @@ def matches_of(argument: tuple[str, list[tuple[int, int]], str], link: Progress)
         argument: the job's file, the pairs, the file to be written.
     """
     job, pairs, target = Job.load(Path(argument[0])), argument[1], Path(argument[2])
-    with TemporaryDirectory(prefix="fieldfuse-") as folder:
-        own = replace(job, folder=folder, threads=1)
+    with _scratch() as folder:
+        own = replace(job, folder=str(folder), threads=1)
         _excerpt(job.database, own.database, pairs)
         if job.features == XFEAT:
             _compare(own, pairs, lambda done: link.update(done / 2, len(pairs)))
         for done, step in enumerate(_steps(pairs)):
             link.update(done * PAIRS_A_STEP, len(pairs))
-            _match(own, Path(folder), step)
-        found = Path(folder) / target.name  # SQLite writes where its locks work
+            _match(own, folder, step)
+        found = folder / target.name  # SQLite writes where its locks work
         _excerpt(own.database, found, [])
         with atomic_path(target) as path:
             shutil.copyfile(found, path)
+
+
+@contextmanager
+def _scratch() -> Iterator[Path]:
+    """A folder on this node's own disk while the block lasts. Those of tasks that were killed go first."""
+    place, name = Path(gettempdir()), f"fieldfuse-matching-{gethostname()}-"
+    for folder in place.glob(f"{name}*"):
+        owner = folder.name.removeprefix(name)
+        if owner.isdecimal() and (int(owner) == os.getpid() or not psutil.pid_exists(int(owner))):
+            remove(folder)
+    folder = place / f"{name}{os.getpid()}"
+    folder.mkdir(mode=0o700)
+    try:
+        yield folder
+    finally:
+        remove(folder)
 
 
 def _excerpt(source: Path, target: Path, pairs: list[tuple[int, int]]) -> None:
