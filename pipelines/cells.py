@@ -13,7 +13,7 @@ import numpy as np
 import torch
 
 from fieldfuse.capture.types import Views
-from fieldfuse.cluster import Message, Task, Workers, open_workers
+from fieldfuse.cluster import Task, Workers, open_workers
 from fieldfuse.errors import FieldfuseError, InputError, Interrupted
 from fieldfuse.files import fingerprint, read_json, remove, write_json
 from fieldfuse.nerfusion.decoder import Deferred
@@ -103,29 +103,17 @@ def _fit_missing(job: Job, folder: Path, plan: cells.ScenePlan, workers: Workers
     missing = cells.missing(folder, plan)
     if not missing:
         return
-    shares = dict.fromkeys(missing, 0.0)
-    tasks = [Task(f"cell {cell + 1}", (str(folder), cell), memory=plan.memory[cell]) for cell in missing]
+    tasks = [Task(f"cell {cell + 1} of {plan.count}", (str(folder), cell), memory=plan.memory[cell]) for cell in missing]
     if refusal := next(filter(None, map(workers.too_large, tasks)), None):
         raise InputError(f"{refusal}; give more --cells, or add a node")
-    failed: list[str] = []
     at_once = workers.at_once(max(tasks, key=lambda task: task.memory))
 
-    def show() -> None:
-        done = plan.count - len(missing) + sum(shares.values())
-        job.progress.update(done, plan.count, f"{plan.count} cells, {at_once} at once")
+    def show(done: float) -> None:
+        job.progress.update(plan.count - len(missing) + done, plan.count, f"{plan.count} cells, {at_once} at once")
         if job.progress.stopping():
             workers.stop()
 
-    def listen(news: Message) -> None:
-        if isinstance(news.data, dict) and "done" in news.data:
-            shares[int(news.task.split()[1]) - 1] = news.data["done"] / max(news.data["total"], 1e-9)
-        show()
-
-    for task, outcome in workers.run(cells.fit_cell_of, tasks, listen):
-        shares[task.argument[1]] = 1.0 if outcome.error is None else 0.0
-        if outcome.error is not None and outcome.kind != "Interrupted":
-            failed.append(f"{task.name} of {plan.count} (on {outcome.node or 'a node that was lost'}): {outcome.error}")
-        show()
+    failed = workers.finish(cells.fit_cell_of, tasks, show)
     job.progress.check()
     if failed:
         raise FieldfuseError(f"{failed[0]}; {plan.count - len(failed)} cells are kept, run the same command again to fit the rest")

@@ -452,7 +452,7 @@ class Settings:
     device: Annotated[str, one_of("auto", "cpu", "cuda")] = "auto"
     threads: Positive | None = None  # None: all cores
     seed: Annotated[int, Field(ge=0, lt=2**31)] = 0
-    address: str | None = None  # of a Ray cluster for cells: auto or HOST:PORT; None: this machine
+    address: str | None = None  # of a Ray cluster for cells and their poses: auto or HOST:PORT; None: this machine
     capture: CaptureSettings = default(default_factory=CaptureSettings)
     poses: PosesSettings = default(default_factory=PosesSettings)
     views: ViewsSettings = default(default_factory=ViewsSettings)

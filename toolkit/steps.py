@@ -164,7 +164,7 @@ def camera_poses(
     check_measures(capture, settings.poses)
     if uses_given_poses(capture, settings):
         return check_given(capture, given_poses(capture), settings.poses.convention, progress, {} if features is None else features)
-    return find_poses(capture, folder, settings.poses, settings.seed, settings.threads, progress)
+    return find_poses(capture, folder, settings.poses, settings.seed, settings.threads, progress, settings.address)
 
 
 def find_scaling(capture: Capture, poses: PoseResult, settings: Settings, progress: Progress = SILENT) -> Scaling | None:

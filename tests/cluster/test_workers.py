@@ -93,6 +93,13 @@ def test_values_and_errors_come_as_tasks_end(workers: Workers) -> None:
     assert {news.task for news in said if news.data.get("note") == "inverting"} == set(found)
 
 
+def test_how_many_are_done_and_which_failed(workers: Workers) -> None:
+    done: list[float] = []
+    (failed,) = workers.finish(invert, [Task("half", 2), Task("wrong", -1), Task("third", 3)], done.append)
+    assert failed in [f"wrong (on {node.name}): -1 is below zero; give another" for node in workers.nodes]
+    assert done[-1] == 2 and max(done) <= 3
+
+
 def test_stopping_lets_what_runs_end_and_begins_nothing_more(workers: Workers, tmp_path: Path) -> None:
     tasks = [Task(str(number), str(tmp_path / str(number))) for number in range(6)]
 

@@ -100,7 +100,7 @@ def test_cells_that_no_node_has_memory_for_are_refused_by_name(room: Path, tmp_p
     monkeypatch.setattr(cells, "CORNER_BYTES", 10**6)
     monkeypatch.setattr("fieldfuse.pipelines.cells.open_workers", workers_here)
     answer = said("run", room, "--out", tmp_path / "out", *OPTIONS)
-    assert answer.code == 2 and "cell 1 needs 1 cores" in answer.err and "give more --cells, or add a node" in answer.err, answer.err
+    assert answer.code == 2 and "cell 1 of 3 needs 1 cores" in answer.err and "give more --cells, or add a node" in answer.err, answer.err
     assert (tmp_path / "out" / "cells" / "plan.json").is_file()  # the coarse fit is kept
 
 

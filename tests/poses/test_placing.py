@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pycolmap
@@ -14,12 +15,12 @@ from scipy.spatial.transform import Rotation
 
 from fieldfuse.capture import open_capture
 from fieldfuse.config import PosesSettings
+from fieldfuse.poses import child, mapping, worker
 from fieldfuse.poses import database as store
-from fieldfuse.poses import mapping, worker
 from fieldfuse.poses.health import doubts
-from fieldfuse.poses.job import MAX_ASKED_AGAIN, MAX_EXHAUSTIVE, Job
+from fieldfuse.poses.job import IN_PARTS, MAX_ASKED_AGAIN, MAX_EXHAUSTIVE, STRICT, Job
 from fieldfuse.poses.mapping import agreement, leave_out, plain
-from fieldfuse.poses.pairs import choose_pairs, pairs_with
+from fieldfuse.poses.pairs import choose_pairs, pairs_with, sequential_pairs
 from fieldfuse.poses.points import epipolar_distance
 from fieldfuse.poses.sfm import find_poses
 from tests.conftest import shared_data
@@ -155,7 +156,7 @@ def job(tmp_path_factory) -> Job:
 @pytest.fixture
 def model(job) -> mapping.Model:
     model, attempts = mapping.map_images(job, silent)
-    assert model is not None and attempts == [{"attempt": mapping.STRICT, "models": [8]}]
+    assert model is not None and attempts == [{"attempt": STRICT, "models": [8]}]
     return model
 
 
@@ -184,3 +185,44 @@ def test_points_that_got_lost_are_dropped_and_told_of_no_more(job, model):
     found = plain(model)
     assert np.isfinite(found["error"]) and found["error"] < 1.0
     assert np.isfinite(found["points"]).all() and max(found["point_errors"]) < 4.0
+
+
+# ------------------------------------------------------------------------------------------------- many images
+
+
+@pytest.fixture(scope="module")
+def many(tmp_path_factory) -> tuple[Job, np.ndarray]:
+    poses = arc(16, 80.0)
+    capture = write_capture(tmp_path_factory.mktemp("many") / "photos", [render(pose)[0] for pose in poses], ordered=True)
+    return made_job(capture, sequential_pairs(16, (1, 2, 3, 4, 5)), PosesSettings(max_features=600)), poses
+
+
+def test_many_images_are_mapped_in_parts(many, monkeypatch):
+    job, poses = many
+    monkeypatch.setattr(mapping, "LARGE", 15)
+    monkeypatch.setattr(mapping, "PART", 9)
+    monkeypatch.setattr(mapping, "SHARED", 6)
+    monkeypatch.setattr(child, "REPEATED", 0.01)
+    notes: list[str] = []
+    model, attempts = mapping.map_images(job, lambda done, total, note: notes.append(note))
+    assert [attempt["attempt"] for attempt in attempts] == [IN_PARTS]
+    assert model is not None and len(model.registered) == 16 and model.error < 1.0
+    assert centre_error(model, poses) < 0.01
+    assert notes.count("mapping in parts of 9 images") > 5
+
+
+def test_parts_that_leave_too_many_out_are_not_used(many, monkeypatch):
+    job, _ = many
+    monkeypatch.setattr(mapping, "LARGE", 15)
+    real = mapping._in_parts
+
+    def part(job: Job, report: Any) -> list[Any]:
+        (found,) = real(job, report)
+        for image_id in sorted(found.reg_image_ids())[:4]:
+            found.deregister_frame(found.image(image_id).frame_id)
+        return [found]
+
+    monkeypatch.setattr(mapping, "_in_parts", part)
+    model, attempts = mapping.map_images(job, silent)
+    assert attempts == [{"attempt": IN_PARTS, "models": [12]}, {"attempt": STRICT, "models": [16]}]
+    assert model is not None and model.attempt == STRICT

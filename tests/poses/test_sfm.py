@@ -19,8 +19,9 @@ from fieldfuse.capture.types import Capture, Frame
 from fieldfuse.config import PosesSettings
 from fieldfuse.errors import InputError, Interrupted, PoseError
 from fieldfuse.files import read_json
+from fieldfuse.poses import sfm
 from fieldfuse.poses.child import run_child
-from fieldfuse.poses.job import GONE_FAR, GONE_ON
+from fieldfuse.poses.job import GONE_FAR, GONE_ON, IN_PARTS, Job
 from fieldfuse.poses.result import PoseResult
 from fieldfuse.poses.sfm import find_poses
 from fieldfuse.progress import Progress
@@ -89,6 +90,18 @@ def test_progress_tells_each_step_and_never_goes_back(found):
     assert any(note.startswith("matching") for note in listener.notes)
     assert any("registered" in note for note in listener.notes)
     assert all(b >= a - 1e-9 for a, b in zip(listener.shares, listener.shares[1:], strict=False))
+
+
+def test_mapping_in_parts_is_noted(found):
+    _, out, _ = found
+    job, facts = Job.load(out / "sparse" / "job.json"), read_json(out / "sparse" / "result.json")
+    parts = {"attempt": IN_PARTS, "models": [8]}
+    capture = Capture("photos", out / "photos", job.images)
+    together = {**facts, "attempts": [parts], "model": {**facts["model"], "attempt": IN_PARTS}}
+    assert "parts of 500 images were mapped side by side on one machine and put together" in sfm._result(capture, job, together).warnings
+    whole = {**facts, "attempts": [parts, *facts["attempts"]]}
+    assert any("all were mapped in one piece" in text for text in sfm._result(capture, job, whole).warnings)
+    assert not any("parts of 500" in text for text in sfm._result(capture, job, facts).warnings)
 
 
 def test_points_reproject_and_opencv_axes_hold(found):

@@ -70,11 +70,11 @@ def require(name: str, found: dict[str, Any], expected: dict[str, str], out: Pat
         return
     if not found["probe"]:
         raise InputError(
-            f"the node {name} does not see {out.absolute()}; choose a folder on storage that all nodes mount alike, or use --upload"
+            f"the node {name} does not see {out.absolute()}; choose a folder on storage that all nodes mount alike (or `batch` with --upload)"
         )
     if found["missing"]:
         raise InputError(
-            f"the node {name} does not see {found['missing'][0]}; put it on storage that all nodes mount at the same path, or use --upload"
+            f"the node {name} does not see {found['missing'][0]}; put it on storage that all nodes mount at the same path (or `batch` with --upload)"
         )
     if found["write"]:
         raise OutputError(f"the node {name} cannot write in {out.absolute()}: {found['write']}; free space there or choose another --out")

@@ -134,6 +134,30 @@ class Workers(ABC):
         `listen` gets what they say, and `{"begun": True}` whenever one begins, or begins again because its worker was lost.
         """
 
+    def finish(self, function: Function, tasks: Sequence[Task], show: Callable[[float], None]) -> list[str]:
+        """Run tasks to their end.
+
+        Args:
+            show: gets how many are done, with parts of those that run, whenever that is known anew.
+
+        Returns:
+            a sentence for each that failed: its name, where, and why.
+        """
+        shares = dict.fromkeys((task.name for task in tasks), 0.0)
+        failed: list[str] = []
+
+        def listen(news: Message) -> None:
+            if isinstance(news.data, dict) and "done" in news.data:
+                shares[news.task] = news.data["done"] / max(news.data["total"], 1e-9)
+            show(sum(shares.values()))
+
+        for task, outcome in self.run(function, tasks, listen):
+            shares[task.name] = 1.0 if outcome.error is None and outcome.begun else 0.0
+            if outcome.error is not None and outcome.kind != "Interrupted":
+                failed.append(f"{task.name} (on {outcome.node or 'a node that was lost'}): {outcome.error}")
+            show(sum(shares.values()))
+        return failed
+
     def stop(self) -> None:
         """No task begins any more, and `Link.stopping` is true in those that run. May be called by a signal's handler."""
         self.stopped = True

@@ -17,7 +17,7 @@ import subprocess
 import sys
 import threading
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import IO, Any
 
@@ -27,6 +27,7 @@ from fieldfuse.progress import SILENT, Progress
 PR_SET_PDEATHSIG = 1
 TICK = 0.2  # seconds between looks at whether the user stopped the run
 SILENCE = 1800.0  # seconds without a word from the child after which it counts as hung
+REPEATED = 60.0  # seconds between two reports that it is still at work
 LOG_TAIL = 200  # lines of the log that are looked at for the reason of a crash
 
 
@@ -190,6 +191,25 @@ def die_with_parent() -> None:
         os._exit(3)
 
     threading.Thread(target=watch, daemon=True).start()
+
+
+@contextlib.contextmanager
+def alive(say: Callable[[], None]) -> Iterator[None]:
+    """Say something now and every minute while a block is at work that may be silent for longer than `SILENCE`."""
+    done = threading.Event()
+
+    def repeat() -> None:
+        while not done.wait(REPEATED):
+            say()
+
+    say()
+    thread = threading.Thread(target=repeat, daemon=True)
+    thread.start()
+    try:
+        yield
+    finally:
+        done.set()
+        thread.join()
 
 
 class Messages:

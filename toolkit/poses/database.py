@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 from collections.abc import Callable, Iterator
 from concurrent.futures import Future, ThreadPoolExecutor
 from contextlib import contextmanager
@@ -12,15 +13,20 @@ from typing import Any
 import cv2
 import numpy as np
 import pycolmap
+from safetensors import safe_open
+from safetensors.numpy import save_file
 
 from fieldfuse.camera import Array, directions_of
 from fieldfuse.capture.images import load_image, usable_pixels
 from fieldfuse.capture.types import Frame
+from fieldfuse.cluster import Task
 from fieldfuse.errors import InputError
-from fieldfuse.files import read_json, remove, write_json
+from fieldfuse.files import atomic_path, fingerprint, read_json, remove, write_json
 from fieldfuse.poses.job import SIFT, TOLERANCE, Job
 from fieldfuse.poses.pairs import COARSE, coarse
 from fieldfuse.poses.points import at_pixels
+from fieldfuse.poses.spread import FOLDER, spread
+from fieldfuse.progress import Progress
 
 CONTRAST = 0.014  # finds as many as COLMAP's own detector does with its threshold
 THUMBNAIL = 32  # pixels a side of the image, by which identical ones are found
@@ -34,7 +40,11 @@ LEAST_STANDING, STANDING_SHARE = 8, 0.15  # matches that stand still, and their 
 LEAST_MOVING = 12  # matches that move, and that one epipolar geometry must explain
 STRAIGHT = 0.75  # share of them that go away from one point where the camera did not turn
 
+IMAGES_A_TASK = 16  # whose features one task on a cluster finds
+IMAGES_WORTH = 50  # for each thread of this machine, from which the cluster is worth its start (docs/cluster.md)
+
 Report = Callable[[float, float, str], None]
+Found = tuple[dict[str, Any], Array, Array]  # record, keypoints, descriptors of an image
 
 
 @contextmanager
@@ -72,7 +82,7 @@ def open_database(job: Job) -> pycolmap.Database:
 
 
 def _discard(job: Job) -> None:
-    for path in (job.records, job.key_file, job.result, *Path(job.folder).glob(f"{job.database.name}*")):
+    for path in (job.records, job.key_file, job.result, Path(job.folder) / FOLDER, *Path(job.folder).glob(f"{job.database.name}*")):
         remove(path)
 
 
@@ -104,7 +114,8 @@ def learned(grey: Array, most: int) -> tuple[Array, Array]:
     from fieldfuse.poses import xfeat  # torch takes a second and 200 MB, and is not always needed
 
     network = xfeat.installed()
-    assert network is not None  # a job with these features is made only where the weights are
+    if network is None:  # on a node: a job with these features is made only where the weights are
+        raise InputError(f"XFeat's weights are not installed there; {xfeat.INSTALL}")
     keypoints, descriptors = xfeat.detect(network, grey, most)
     return keypoints, descriptors.astype(np.float16).view(np.uint8)
 
@@ -129,7 +140,7 @@ def extract(job: Job, database: pycolmap.Database, report: Report) -> list[dict[
     report(done, len(job.images), f"features {done} of {len(job.images)}")
     with pycolmap.DatabaseTransaction(database):
         _write_rigs(job, database)
-    for index, (record, keypoints, descriptors) in _features(job, todo):
+    for index, (record, keypoints, descriptors) in _features(job, todo, report):
         if not database.exists_image(label(index)):
             with pycolmap.DatabaseTransaction(database):
                 _write_image(job, database, index, record, keypoints, descriptors)
@@ -142,10 +153,17 @@ def extract(job: Job, database: pycolmap.Database, report: Report) -> list[dict[
     return [records[image.name] for image in job.images]
 
 
-def _features(job: Job, indices: list[int]) -> Iterator[tuple[int, tuple[dict[str, Any], Array, Array]]]:
-    """Features of the images at `indices`, a few ahead, in order."""
+def _features(job: Job, indices: list[int], report: Report) -> Iterator[tuple[int, Found]]:
+    """Features of the images at `indices`, in order: of the job's cluster, where there is one and it helps, or a few ahead."""
+    if job.address is not None and len(indices) >= IMAGES_WORTH * job.threads:
+        places = _spread(job, indices, report)
+        for path in places:
+            yield from _read_features(path)
+        remove(Path(job.folder) / FOLDER)
+        if places:
+            return
     with ThreadPoolExecutor(job.threads) as pool:
-        ahead: list[tuple[int, Future[tuple[dict[str, Any], Array, Array]]]] = []
+        ahead: list[tuple[int, Future[Found]]] = []
         for index in indices:
             ahead.append((index, pool.submit(_describe, job.images[index], job)))
             if len(ahead) > 2 * job.threads:
@@ -155,7 +173,46 @@ def _features(job: Job, indices: list[int]) -> Iterator[tuple[int, tuple[dict[st
             yield first, future.result()
 
 
-def _describe(frame: Frame, job: Job) -> tuple[dict[str, Any], Array, Array]:
+def _spread(job: Job, indices: list[int], report: Report) -> list[Path]:
+    """Have the nodes of the job's cluster find features; files of these in order, none where the nodes would not be faster."""
+    folder, count, missing = Path(job.folder) / FOLDER, len(job.images), set(indices)
+    job.save(folder / "job.json")
+    tasks = []
+    for start in range(0, count, IMAGES_A_TASK):  # of all images, so that an interrupted run's files are those of the next
+        part = [index for index in range(start, min(start + IMAGES_A_TASK, count)) if index in missing]
+        if part:
+            argument = (str(folder / "job.json"), part, str(folder / f"features-{fingerprint(part)}.safetensors"))
+            tasks.append(Task(f"features of images {part[0] + 1} to {part[-1] + 1}", argument, memory=job.feature_bytes))
+
+    def show(done: float) -> None:
+        report(count - len(indices) + done * len(indices) / len(tasks), count, f"features of {count} images, on the cluster's nodes")
+
+    return [Path(task.argument[-1]) for task in tasks] if spread(job, features_of, tasks, show, job.threads) else []
+
+
+def features_of(argument: tuple[str, list[int], str], link: Progress) -> None:
+    """A task: the features of some images of a job, into a file.
+
+    Args:
+        argument: the job's file, indices of its images, the file to be written.
+    """
+    cv2.setNumThreads(1)
+    job, indices, target = Job.load(Path(argument[0])), argument[1], Path(argument[2])
+    arrays, records = dict[str, Array](), dict[str, Any]()
+    for done, index in enumerate(indices):
+        link.update(done, len(indices))
+        records[str(index)], arrays[f"keypoints {index}"], arrays[f"descriptors {index}"] = _describe(job.images[index], job)
+    with atomic_path(target) as path:
+        save_file(arrays, path, {"records": json.dumps(records)})
+
+
+def _read_features(path: Path) -> Iterator[tuple[int, Found]]:
+    with safe_open(path, "numpy") as file:
+        for index, record in json.loads(file.metadata()["records"]).items():
+            yield int(index), (record, file.get_tensor(f"keypoints {index}"), file.get_tensor(f"descriptors {index}"))
+
+
+def _describe(frame: Frame, job: Job) -> Found:
     """One image as every later stage loads it, its keypoints (N, 4) in its own pixels and descriptors (N, 128) for the database."""
     pixels = load_image(frame, exif=job.exif)
     height, width = pixels.shape[:2]

@@ -21,6 +21,9 @@ MAX_EXHAUSTIVE = 40  # photos; beyond it pairs are chosen
 SIFT, XFEAT = "sift", "xfeat"  # features that images are matched by
 TOLERANCE = 4.0  # pixels, COLMAP's own
 MAX_ASKED_AGAIN = 120  # photos; up to it those that find no place so are matched with all others
+STRICT = "incremental"  # the attempt by COLMAP's own rules
+IN_PARTS = "in parts"  # the same for parts of very many images, which are then put together
+PART = 500  # images of such a part
 GONE_ON = "incremental, gone on with small angles"  # the attempt that adds to the strict one's model what that had no place for
 GONE_FAR = "incremental, gone on with tiny angles"  # the same from there, where cameras turn before a wall and hardly move
 LOOSE = "incremental, small angles"  # from scratch, by looser rules
@@ -66,6 +69,8 @@ class Job:
     features: str = SIFT
     tolerance: float = TOLERANCE  # pixels that a match may be off its epipolar line, and a point off where it is seen
     second: str | None = None  # features that are tried where the first place too few
+    address: str | None = None  # of a Ray cluster whose nodes find features and match, too
+    feature_bytes: int = 0  # memory that finding the features of one image takes
 
     @property
     def database(self) -> Path:

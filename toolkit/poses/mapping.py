@@ -17,14 +17,17 @@ import pycolmap
 from fieldfuse.camera import OPENCV, Intrinsics
 from fieldfuse.errors import PoseError
 from fieldfuse.files import remove
+from fieldfuse.poses.child import alive
 from fieldfuse.poses.database import MIN_INLIERS, Report, keypoints_of, opened
-from fieldfuse.poses.job import GLOBAL, GONE_FAR, GONE_ON, LOOSE, TOLERANCE, Job
+from fieldfuse.poses.job import GLOBAL, GONE_FAR, GONE_ON, IN_PARTS, LOOSE, PART, STRICT, TOLERANCE, Job
 from fieldfuse.poses.points import epipolar_distance
 
-STRICT = "incremental"  # the attempt by COLMAP's own rules
 SMALL_ANGLE, TINY_ANGLE = 1.0, 0.25  # degrees between rays that a point needs in a looser attempt, and in the last that adds images
 LEFT_OUT, LEFT_OUT_SHARE = 3, 0.02  # images without a place, and share of all, that are worth that last one
 WORSE = 1.25  # times the error of the strict model that a model which went on from it may have
+LARGE = 2000  # images beyond which parts of them are mapped first: one after the other gets slower with each
+SHARED = 100  # images that a part of them shares with the next
+PARTS_ENOUGH = 0.9  # share of registered images below which such a model is not used, and all are mapped in one piece
 ENOUGH = 0.6  # share of registered images below which a looser attempt is worth its time
 FEW_POINTS = 12  # an image that sees fewer of the model's points hangs in the air: not registered
 SMALLEST = 3  # registered images that make a model
@@ -57,6 +60,7 @@ def map_images(job: Job, report: Report) -> tuple[Model | None, list[dict[str, A
     """The largest trustworthy model in a settled frame, and what every attempt gave: `{"attempt", "models": [frames, …]}`, largest
     first."""
     attempts: list[tuple[str, Callable[[], list[pycolmap.Reconstruction]]]] = [
+        (IN_PARTS, lambda: _in_parts(job, report) if len(job.images) > LARGE and not job.rigged else []),
         (STRICT, lambda: _incremental(job, report)),
         (GONE_ON, lambda: [] if best is None else _incremental(job, report, SMALL_ANGLE, best.reconstruction)),
         (GONE_FAR, lambda: [] if best is None else _incremental(job, report, TINY_ANGLE, best.reconstruction)),
@@ -70,6 +74,8 @@ def map_images(job: Job, report: Report) -> tuple[Model | None, list[dict[str, A
             continue
         models = sorted((Model(found, name, _registered(found)) for found in attempt()), key=lambda model: model.size, reverse=True)
         models = [model for model in models if len(model.registered) >= SMALLEST]
+        if name == IN_PARTS and not models:
+            continue
         history.append({"attempt": name, "models": [len(model.registered) for model in models]})
         for model in models:
             if model.error <= MAX_ERROR * max(1.0, job.tolerance / TOLERANCE) and (best is None or _better(model, best)):
@@ -98,6 +104,8 @@ def _enough(attempt: str, images: int) -> float:
     """Registered images from which an attempt is not worth its time."""
     if attempt == GONE_ON:
         return images
+    if attempt == STRICT:
+        return PARTS_ENOUGH * images
     if attempt == GONE_FAR:
         return images - many(images) + 0.5
     return ENOUGH * images
@@ -194,8 +202,26 @@ def _incremental(
     return list(found.values())
 
 
+def _in_parts(job: Job, report: Report) -> list[pycolmap.Reconstruction]:
+    """The models of `PART` images each, which several threads make by COLMAP's own rules, put together; the largest is adjusted, since
+    parts are joined by nothing but a similarity."""
+    options = pycolmap.HierarchicalPipelineOptions()
+    options.incremental_options = _options(job)
+    options.num_threads = options.num_workers = job.threads
+    options.clustering_options.leaf_max_num_images = PART
+    options.clustering_options.image_overlap = SHARED
+    pycolmap.set_random_seed(job.seed)
+    folder = _empty(Path(job.folder) / "attempt")
+    with alive(lambda: report(0, len(job.images), f"mapping in parts of {PART} images")):
+        found = list(pycolmap.hierarchical_mapping(job.database, folder, folder, options).values())
+        models = [Model(one, IN_PARTS, _registered(one)) for one in found]
+        best = max(models, key=lambda model: model.size, default=None)
+        if best is not None and len(best.registered) >= SMALLEST:
+            finish(job, best, report)
+    return found
+
+
 def _global(job: Job, report: Report) -> list[pycolmap.Reconstruction]:
-    report(0, len(job.images), "mapping all at once")
     # Calibrating the view graph rewrites cameras and pairs: on a copy, so that a re-run starts from the same matches.
     copy = Path(job.folder) / "global.db"
     remove(copy)
@@ -207,7 +233,8 @@ def _global(job: Job, report: Report) -> list[pycolmap.Reconstruction]:
         options.num_threads = job.threads
         options.random_seed = job.seed
         folder = _empty(Path(job.folder) / "attempt")
-        return list(pycolmap.global_mapping(copy, folder, folder, options).values())
+        with alive(lambda: report(0, len(job.images), "mapping all at once")):
+            return list(pycolmap.global_mapping(copy, folder, folder, options).values())
     finally:
         remove(copy)
 
@@ -240,7 +267,7 @@ def finish(job: Job, model: Model, report: Report) -> None:
     options.ceres.solver_options.num_threads = job.repeating
     pycolmap.bundle_adjustment(model.reconstruction, options)
     # As after each of the mapper's own: a point that hardly any parallax held may have gone behind a camera, or to where numbers end.
-    rules = _options(job, None if model.attempt == STRICT else TINY_ANGLE if model.attempt == GONE_FAR else SMALL_ANGLE).mapper
+    rules = _options(job, None if model.attempt in (STRICT, IN_PARTS) else TINY_ANGLE if model.attempt == GONE_FAR else SMALL_ANGLE).mapper
     pycolmap.ObservationManager(model.reconstruction).filter_all_points3D(rules.filter_max_reproj_error, rules.filter_min_tri_angle)
     model.registered = _registered(model.reconstruction)
     settle(model)

@@ -4,21 +4,29 @@ from __future__ import annotations
 
 import os
 import shutil
+import sqlite3
 import threading
 from collections.abc import Callable, Iterator
 from concurrent.futures import ProcessPoolExecutor, ThreadPoolExecutor
-from contextlib import contextmanager, suppress
+from contextlib import closing, contextmanager, suppress
+from dataclasses import replace
 from functools import lru_cache
 from multiprocessing import get_context, parent_process
 from pathlib import Path
 from queue import SimpleQueue
+from socket import gethostname
+from tempfile import gettempdir
 
+import psutil
 import pycolmap
 
 from fieldfuse.camera import Array
-from fieldfuse.files import atomic_path, remove
+from fieldfuse.cluster import Task
+from fieldfuse.files import atomic_path, fingerprint, remove
 from fieldfuse.poses.database import Report, floats, label, opened
 from fieldfuse.poses.job import XFEAT, Job
+from fieldfuse.poses.spread import FOLDER, spread
+from fieldfuse.progress import Progress
 
 # Learned features nearly always match something, and of hundreds of false matches some dozens agree with some geometry or other.
 LEAST_RATIO = 0.2  # share of such a pair's matches that have to
@@ -26,6 +34,8 @@ MOST_TRIALS = 3000  # which so many trials find
 PAIRS_A_STEP = 40  # matched between two progress reports
 MOST_MATCHERS = 8  # processes, each of a hundred megabytes and more
 MOST_DESCRIBED = 128  # images whose learned descriptors are held in memory, of a megabyte each
+PAIRS_A_TASK = 200  # matched by one task on a cluster
+PAIRS_WORTH = 200  # for each process of this machine, from which the cluster is worth its start (docs/cluster.md)
 MOST_COPIED = 2**30  # bytes of all copies of the database, of which each process that matches has one
 
 
@@ -43,9 +53,12 @@ def match(job: Job, pairs: list[tuple[int, int]], report: Report) -> None:
         before = 0.5 if job.features == XFEAT else 0.0
         report(before * total + (1 - before) * done, total, f"matching, pair {done} of {total}")
 
-    if job.features == XFEAT:
+    if job.address is not None and total >= PAIRS_WORTH * _processes(job):
+        _spread(job, pairs, left, report)
+        left = _left(job, left)
+    if job.features == XFEAT and left:
         _compare(job, left, lambda done: report(done / 2, total, f"matching, pair {done} of {total}"))
-    show(0)
+    show(total - len(left))
     with suppress(RuntimeError):  # no room for what copies grow to, or a process ended for its memory: what is left is matched here
         _together(job, left, show)
     left = _left(job, left)
@@ -53,6 +66,86 @@ def match(job: Job, pairs: list[tuple[int, int]], report: Report) -> None:
     for step in _steps(left):
         _match(job, Path(job.folder), step)
         show(done := done + len(step))
+
+
+def _spread(job: Job, pairs: list[tuple[int, int]], left: list[tuple[int, int]], report: Report) -> None:
+    """Have the nodes of the job's cluster match what is left of `pairs`, if they are faster."""
+    folder, missing = Path(job.folder) / FOLDER, set(left)
+    job.save(folder / "job.json")
+    tasks, parts = [], []
+    for start in range(0, len(pairs), PAIRS_A_TASK):  # of all pairs, so that an interrupted run's files are those of the next
+        part = pairs[start : start + PAIRS_A_TASK]
+        if missing.intersection(part):
+            argument = (str(folder / "job.json"), part, str(folder / f"matches-{fingerprint(part)}.db"))
+            tasks.append(Task(f"matching of pairs {start + 1} to {start + len(part)}", argument))
+            parts.append(part)
+
+    def show(done: float) -> None:
+        pair = int(done * len(left) / len(tasks))
+        report(pair, len(left), f"matching, pair {pair} of {len(left)}, on the cluster's nodes")
+
+    show(0)
+    if spread(job, matches_of, tasks, show, _processes(job)):
+        for task, part in zip(tasks, parts, strict=True):  # not before all are done: tasks read the database
+            _bring(Path(task.argument[-1]), job.database, part)
+    remove(folder)
+
+
+def matches_of(argument: tuple[str, list[tuple[int, int]], str], link: Progress) -> None:
+    """A task: match and verify some pairs of images, into a database of their own without features.
+
+    Args:
+        argument: the job's file, the pairs, the file to be written.
+    """
+    job, pairs, target = Job.load(Path(argument[0])), argument[1], Path(argument[2])
+    with _scratch() as folder:
+        own = replace(job, folder=str(folder), threads=1)
+        _excerpt(job.database, own.database, pairs)
+        if job.features == XFEAT:
+            _compare(own, pairs, lambda done: link.update(done / 2, len(pairs)))
+        for done, step in enumerate(_steps(pairs)):
+            link.update(done * PAIRS_A_STEP, len(pairs))
+            _match(own, folder, step)
+        found = folder / target.name  # SQLite writes where its locks work
+        _excerpt(own.database, found, [])
+        with atomic_path(target) as path:
+            shutil.copyfile(found, path)
+
+
+@contextmanager
+def _scratch() -> Iterator[Path]:
+    """A folder on this node's own disk while the block lasts. Those of tasks that were killed go first."""
+    place, name = Path(gettempdir()), f"fieldfuse-matching-{gethostname()}-"
+    for folder in place.glob(f"{name}*"):
+        owner = folder.name.removeprefix(name)
+        if owner.isdecimal() and (int(owner) == os.getpid() or not psutil.pid_exists(int(owner))):
+            remove(folder)
+    folder = place / f"{name}{os.getpid()}"
+    folder.mkdir(mode=0o700)
+    try:
+        yield folder
+    finally:
+        remove(folder)
+
+
+def _excerpt(source: Path, target: Path, pairs: list[tuple[int, int]]) -> None:
+    """Make a database of all images of another, with features and matches of `pairs`, or of none with all matches and no features.
+
+    SQLite reads the other one without locks, which storage of several machines seldom has; nobody writes to it meanwhile.
+    """
+    pycolmap.Database.open(target).close()
+    with closing(sqlite3.connect(target, uri=True)) as database:
+        database.execute("ATTACH ? AS source", (f"{source.absolute().as_uri()}?immutable=1",))
+        ids = {int(name): number for number, name in database.execute("SELECT image_id, name FROM source.images")}
+        images = ",".join(str(ids[index]) for index in sorted({index for pair in pairs for index in pair}))
+        numbers = ",".join(str(pycolmap.image_pair_to_pair_id(ids[i], ids[j])) for i, j in pairs)
+        where = {"keypoints": f"image_id IN ({images})", "descriptors": f"image_id IN ({images})"}
+        if pairs:
+            where |= {"matches": f"pair_id IN ({numbers})", "two_view_geometries": f"pair_id IN ({numbers})"}
+        names = "SELECT name FROM source.sqlite_master WHERE type = 'table' AND name NOT LIKE 'sqlite_%'"
+        for (table,) in database.execute(names).fetchall():
+            database.execute(f"INSERT INTO main.{table} SELECT * FROM source.{table} WHERE {where.get(table, '1')}")
+        database.commit()
 
 
 def _compare(job: Job, pairs: list[tuple[int, int]], show: Callable[[int], None]) -> None:
@@ -76,6 +169,11 @@ def _compare(job: Job, pairs: list[tuple[int, int]], show: Callable[[int], None]
                         database.write_matches(ids[i], ids[j], matches)
 
 
+def _processes(job: Job) -> int:
+    """That match on this machine at the same time."""
+    return min(job.threads, MOST_MATCHERS)
+
+
 def _steps(pairs: list[tuple[int, int]]) -> list[list[tuple[int, int]]]:
     """Pairs that are matched between two progress reports."""
     return [pairs[start : start + PAIRS_A_STEP] for start in range(0, len(pairs), PAIRS_A_STEP)]
@@ -86,7 +184,7 @@ def _together(job: Job, pairs: list[tuple[int, int]], show: Callable[[int], None
     them failed; what the others did stays."""
     steps, done, lock = _steps(pairs), 0, threading.Lock()
     free: SimpleQueue[Path] = SimpleQueue()
-    with _copies(job, min(job.threads, MOST_MATCHERS, len(steps))) as folders:
+    with _copies(job, min(_processes(job), len(steps))) as folders:
         if len(folders) < 2:
             return
         for folder in folders:

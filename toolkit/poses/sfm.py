@@ -21,7 +21,7 @@ from fieldfuse.errors import FieldfuseError, InputError, PoseError
 from fieldfuse.files import read_json, remove
 from fieldfuse.poses.child import run_child
 from fieldfuse.poses.health import doubts, failure, fold, shortfalls, standing
-from fieldfuse.poses.job import GONE_FAR, GONE_ON, SIFT, XFEAT, Job, plan
+from fieldfuse.poses.job import GONE_FAR, GONE_ON, IN_PARTS, PART, SIFT, STRICT, XFEAT, Job, plan
 from fieldfuse.poses.result import SFM, PoseResult, scale_to_depth
 from fieldfuse.progress import SILENT, Progress
 
@@ -37,6 +37,7 @@ def find_poses(
     seed: int = 0,
     threads: int | None = None,
     progress: Progress = SILENT,
+    address: str | None = None,
 ) -> PoseResult:
     """Structure from motion over the capture's images; poses and intrinsics that it brings are not used.
 
@@ -44,9 +45,12 @@ def find_poses(
     settings are the same. With the same seed the result repeats; up to `job.REPEATABLE` images that of the incremental
     mapper does bit for bit, whatever the threads. A capture with depth maps gets the depth's scale.
 
+    Args:
+        address: of a Ray cluster that finds features and matches where these are many: "auto" or HOST:PORT.
+
     Raises:
         PoseError: no usable poses, and why; or the child process crashed.
-        InputError: an image cannot be read, or there is too little memory.
+        InputError: an image cannot be read, there is too little memory, or the cluster cannot be used.
         Interrupted: the user asked to stop.
     """
     settings = settings or PosesSettings()
@@ -62,6 +66,7 @@ def find_poses(
     )
     first, second, notes = _features(settings.features)
     job = plan(capture, Path(out).resolve() / "sparse", settings, seed, workers, first, second)
+    job = replace(job, address=address, feature_bytes=SIFT_BYTES * pixels)
     seconds: dict[str, float] = {}
     began = time.monotonic()
     facts = _run(job, seconds, progress)
@@ -149,10 +154,18 @@ def _result(capture: Capture, job: Job, facts: dict[str, Any]) -> PoseResult:
     known = set(placed)
     sizes = next(attempt["models"] for attempt in facts["attempts"] if attempt["attempt"] == model["attempt"])
     warnings = [*standing(facts), *shortfalls(facts), *doubts(facts), *fold(facts, job.sequential)]
-    strict = max(facts["attempts"][0]["models"], default=0)
+    tried = facts["attempts"]
+    if tried[0]["attempt"] == IN_PARTS:
+        whole = any(attempt["attempt"] == STRICT for attempt in tried)
+        parts = f"parts of {PART} images were mapped side by side on one machine"
+        warnings.append(
+            f"{parts}, and left too many without a place: all were mapped in one piece" if whole else f"{parts} and put together"
+        )
+        tried = tried[1:] if whole else tried
+    strict = max(tried[0]["models"], default=0)
     if model["attempt"] in (GONE_ON, GONE_FAR):
         warnings.append(f"{len(placed) - strict} of {len(placed)} frames were placed by fewer matches and smaller angles than the others")
-    elif model["attempt"] != facts["attempts"][0]["attempt"]:
+    elif model["attempt"] != tried[0]["attempt"]:
         warnings.append(
             f"poses come from a fallback ({model['attempt']} mapping), the strict attempt registered {strict} of {len(names)} frames"
         )

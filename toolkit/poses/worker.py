@@ -22,7 +22,7 @@ from fieldfuse.poses import loops, mapping
 from fieldfuse.poses.child import Messages, die_with_parent
 from fieldfuse.poses.database import Report
 from fieldfuse.poses.health import AGREES, failure, hopeless, turned_only
-from fieldfuse.poses.job import GLOBAL, LOOSE, MAX_ASKED_AGAIN, MAX_EXHAUSTIVE, Job
+from fieldfuse.poses.job import GLOBAL, LOOSE, MAX_ASKED_AGAIN, MAX_EXHAUSTIVE, STRICT, Job
 from fieldfuse.poses.mapping import Model, agreement, leave_out
 from fieldfuse.poses.match import match
 from fieldfuse.poses.pairs import Pairs, choose_pairs, pairs_with
@@ -155,7 +155,7 @@ def _better(after: Placed, before: Placed) -> bool:
     gained = sum(share >= AGREES for share in new) - sum(share >= AGREES for share in old)
     clean, clearer = min(new, default=0.0) >= AGREES, min(new, default=0.0) > min(old, default=0.0)
     # Learned matches between images that see hardly any parallax get places by looser rules that agree with them and are wrong.
-    strict = after[0] is not None and after[0].attempt == mapping.STRICT
+    strict = after[0] is not None and after[0].attempt == STRICT
     if before[0] is not None and not strict:
         return False
     return (gained > 0 and (clean or strict)) or (gained == 0 and clean and (clearer or _fell_back(before[0])))
