@@ -16,7 +16,16 @@ from typing import Annotated, Any
 import numpy as np
 import typer
 
-from benchmarks.experiment import Experiment, Folder, Row, application, markdown, program, section, show
+from benchmarks.experiment import (
+    Experiment,
+    Folder,
+    Row,
+    application,
+    markdown,
+    program,
+    section,
+    show,
+)
 from fieldfuse.cluster import Task, has_ray, open_workers
 from fieldfuse.cluster.tasks import LISTEN
 from fieldfuse.errors import InputError
@@ -24,7 +33,7 @@ from fieldfuse.files import read_json
 from fieldfuse.pipelines.console import make_progress
 from fieldfuse.pipelines.options import Quiet
 from fieldfuse.progress import Progress
-from fieldfuse.training.cells.scene import SHARE_OF_FINER, PIXELS_A_CELL
+from fieldfuse.training.cells.scene import PIXELS_A_CELL, SHARE_OF_FINER
 from fieldfuse.volume.topology import BLOCK, MAX_TABLE_CELLS
 
 NOTHING = 2000  # tasks that do nothing, to see what a task costs

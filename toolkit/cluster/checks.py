@@ -18,6 +18,7 @@ from fieldfuse.errors import InputError, OutputError
 
 ANSWER = 5.0  # seconds in which an address must accept a connection
 CONNECT = 45.0  # seconds in which Ray must answer at it
+SHARED = "put it on storage that all nodes mount at the same path (or, for a batch, use --upload)"
 
 
 def examiner() -> Callable[[str | None, list[str]], dict[str, Any]]:
@@ -69,13 +70,9 @@ def require(name: str, found: dict[str, Any], expected: dict[str, str], out: Pat
     if out is None:
         return
     if not found["probe"]:
-        raise InputError(
-            f"the node {name} does not see {out.absolute()}; choose a folder on storage that all nodes mount alike (or `batch` with --upload)"
-        )
+        raise InputError(f"the node {name} does not see {out.absolute()}; {SHARED}")
     if found["missing"]:
-        raise InputError(
-            f"the node {name} does not see {found['missing'][0]}; put it on storage that all nodes mount at the same path (or `batch` with --upload)"
-        )
+        raise InputError(f"the node {name} does not see {found['missing'][0]}; {SHARED}")
     if found["write"]:
         raise OutputError(f"the node {name} cannot write in {out.absolute()}: {found['write']}; free space there or choose another --out")
 
