@@ -103,7 +103,7 @@ class Bench:
         with Watch() as before:
             steps.set_seeds(self.settings.seed)
             coarse = fit_guided(self.views, self.scene, settings, begin=Begin(host_for("cpu")), ticks=time.process_time)
-            plan = cells.write_scene(folder, "benchmark", coarse, self.views, self.scene, self.settings)
+            plan = cells.write_scene(folder, "benchmark", coarse, self.scene, self.settings)
         watches = []
         for cell in range(plan.count):
             with Watch() as watch:

@@ -95,7 +95,7 @@ def _cut(job: Job, folder: Path, key: str, views: Views, scene: Scene, begin: Be
         save_left_out(folder / LEFT_OUT, result.left_out)
     if result.matched is not None:
         write_json(folder / MATCHED, result.matched)
-    return cells.write_scene(folder, key, result, views, scene, settings, job.progress)
+    return cells.write_scene(folder, key, result, scene, settings, job.progress)
 
 
 def _fit_missing(job: Job, folder: Path, plan: cells.ScenePlan, workers: Workers) -> None:

@@ -6,9 +6,11 @@ import weakref
 from collections.abc import Callable
 from dataclasses import replace
 from itertools import count
+from pathlib import Path
 
 import numpy as np
 import pytest
+from safetensors import safe_open
 
 from fieldfuse.camera import Similarity
 from fieldfuse.capture.types import Views
@@ -20,6 +22,7 @@ from fieldfuse.render.field import Field
 from fieldfuse.render.image import make_renderer, render_view
 from fieldfuse.stereo import fast_mvs, transients
 from fieldfuse.training import depth_start
+from fieldfuse.training.cells import scene as cells
 from fieldfuse.training.fit import LEAST_VIEWS, Begin
 from fieldfuse.training.guided import find_moving, fit_guided, looks_for_moving, wants_matching
 from tests.stereo.made import FAR, MEDIAN, NEAR, PASSED, corner, with_passer
@@ -58,6 +61,16 @@ def test_depth_by_matching_makes_geometry_better() -> None:
     assert alone.matched is None
     assert guided.matched is not None and guided.matched["views"] == 6 and guided.matched["share"] > 0.3
     assert depth_error(guided.field) < 0.6 * depth_error(alone.field)
+
+
+def test_cells_are_fitted_to_the_depth_that_was_matched(tmp_path: Path) -> None:
+    settings = wanted("fit.cells=2")
+    result = fit_guided(views(), SCENE, cells.coarse_settings(settings, 32), ticks=steady(0.005))
+    assert not any(depth is not None for depth in views().depths)
+    plan = cells.write_scene(tmp_path, "key", result, SCENE, settings)
+    assert plan.count == 2 and plan.rough
+    with safe_open(tmp_path / "pixels-000.safetensors", framework="pt") as file:
+        assert float((file.get_tensor("distance") > 0).float().mean()) > 0.3
 
 
 def test_matching_is_a_part_of_the_budget(monkeypatch: pytest.MonkeyPatch) -> None:

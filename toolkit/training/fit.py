@@ -61,6 +61,7 @@ class FitResult:
     matched: dict[str, float] | None = None  # what was matched before the fit: images, pixels, share with depth, seconds (`guided.py`)
     left_out: LeftOut | None = None  # what the fit did without, since it moves (`guided.py`)
     held_out: list[float] = default(default_factory=list)  # the timeline's last PSNR by held-out view
+    views: Views | None = None  # that it was fitted to: with the depth that was matched, without what moves
 
     def after(self, seconds: float) -> list[dict[str, float]]:
         """The timeline, with so many seconds before it."""
@@ -280,7 +281,7 @@ def fit_field(
     del current  # its rows are the host's
     host.close()
     give_back()
-    result.field = replace(packed(), sky=sky_behind(views))
+    result.field, result.views = replace(packed(), sky=sky_behind(views)), views
     return result
 
 

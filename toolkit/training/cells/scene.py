@@ -119,20 +119,19 @@ def cell_count(views: Views, settings: Settings) -> int:
     return max(1, round(pixels / PIXELS_A_CELL))
 
 
-def write_scene(
-    folder: Path, key: str, result: FitResult, views: Views, scene: Scene, settings: Settings, progress: Progress = SILENT
-) -> ScenePlan:
+def write_scene(folder: Path, key: str, result: FitResult, scene: Scene, settings: Settings, progress: Progress = SILENT) -> ScenePlan:
     """Cut a scene by its coarse field into `cell_count` cells.
 
     Args:
-        result: of the coarse fit.
+        result: of the coarse fit, whose views the cells are fitted to.
 
     Raises:
         InputError: training rays see nothing of the field.
         OutputError: the folder cannot be written.
         Interrupted: the user asked to stop.
     """
-    shown = views if result.left_out is None else result.left_out.without(views)
+    if (shown := result.views) is None:
+        raise ValueError("a result that was not just fitted has no views")
     train = shown.subset(np.flatnonzero(~shown.test))
     coarse = result.field
     least = settings.fit.prune_weight
@@ -144,7 +143,7 @@ def write_scene(
         raise InputError("training rays see nothing of the coarse field, so it cannot be cut into cells; give it more --budget")
     voxels = coarse.occupied.view(-1, BLOCK**3).sum(1).numpy()
     # Seconds go by rays, memory by voxels: cells are to be alike in both.
-    cells = cut(coarse.topology.keys.numpy(), np.sqrt(rays * voxels.astype(np.float64)), cell_count(views, settings))
+    cells = cut(coarse.topology.keys.numpy(), np.sqrt(rays * voxels.astype(np.float64)), cell_count(shown, settings))
     coarse.save(folder / COARSE, scene.working_from_input)
     owners = {"keys": cells.keys, "owner": cells.owner, "rays": rays}
     write_tensors(folder / CELLS, {name: torch.from_numpy(np.ascontiguousarray(values)) for name, values in owners.items()})
