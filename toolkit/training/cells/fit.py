@@ -87,7 +87,8 @@ def fit_cell(
     policy = NonfinitePolicy()
     rays = steps = 0
     while (spent := schedule.position(now := ticks() - begin)) < 1 and not progress.stopping():
-        done = plan.done_before + (1 - plan.done_before) * spent  # of the whole fit: step sizes fall as in one piece
+        # Of the whole fit, as step sizes fall in one piece; with steps by these alone, so that equal steps give the same bits.
+        done = plan.done_before + (1 - plan.done_before) * (spent if plan.steps is None else schedule.position(0))
         if schedule.wants_pruning(done):
             current = pruned(current, visible(current, engine.seen, engine.visits, settings.fit.prune_weight))
             engine.go_on_with(current)
