@@ -33,7 +33,7 @@ from fieldfuse.files import read_json
 from fieldfuse.pipelines.console import make_progress
 from fieldfuse.pipelines.options import Quiet
 from fieldfuse.progress import Progress
-from fieldfuse.training.cells.scene import PIXELS_A_CELL, SHARE_OF_FINER
+from fieldfuse.training.cells.scene import PIXELS_A_CELL, COARSE_SHARE
 from fieldfuse.volume.topology import BLOCK, MAX_TABLE_CELLS
 
 NOTHING = 2000  # tasks that do nothing, to see what a task costs
@@ -132,8 +132,8 @@ def large_site(nodes: int, costs: dict[str, float]) -> Row:
     """The site: its coarse fit on one node, then its cells on all."""
     pixels, slots = 1e6 * PICTURES * MEGAPIXELS, nodes * CORES
     count, seconds = round(pixels / PIXELS_A_CELL), pixels * costs["pixel"]
-    coarse = SHARE_OF_FINER * seconds / (CORES * THREADS)
-    end, losses = simulated([(1 - SHARE_OF_FINER) * seconds / count] * count, slots, costs["cell"], costs["task"])
+    coarse = COARSE_SHARE * seconds / (CORES * THREADS)
+    end, losses = simulated([(1 - COARSE_SHARE) * seconds / count] * count, slots, costs["cell"], costs["task"])
     voxel = (SIDE**2 * HEIGHT / MAX_TABLE_CELLS) ** (1 / 3) / BLOCK  # the table of blocks is a box
     memory = f"{pixels * costs['pixel_bytes'] / 1e9:.0f} GB of memory"
     remarks = f"{count:,} cells; coarse fit {coarse / HOUR:.1f} h, {memory}; voxels ≥ {100 * voxel:.0f} cm"

@@ -86,11 +86,8 @@ def _cut(job: Job, folder: Path, key: str, views: Views, scene: Scene, begin: Be
     result = fit_guided(views, scene, coarse, job.progress, begin)
     if result.interrupted:
         raise Interrupted("stopped on request before the coarse field was done; run the same command again")
-    if result.field.resolution != coarse.field.resolution or not isinstance(result.field.decoder, Deferred):
-        raise InputError(
-            f"the coarse field came to {result.field.resolution}³ voxels and cells need {coarse.field.resolution}³; give more --budget, or "
-            "leave --cells out"
-        )
+    if not isinstance(result.field.decoder, Deferred):
+        raise InputError("cells need the deferred decoder; drop --decoder, or leave --cells out")
     if result.left_out is not None:
         save_left_out(folder / LEFT_OUT, result.left_out)
     if result.matched is not None:

@@ -43,11 +43,10 @@ from fieldfuse.training.fit import DEFAULT_BUDGET, FitResult
 from fieldfuse.training.levels import pruned
 from fieldfuse.training.losses import FINE, ROUGH
 from fieldfuse.training.pixels import PixelPool
-from fieldfuse.training.start import FINER, finest_resolution, space_of
+from fieldfuse.training.start import finest_resolution, space_of
 from fieldfuse.volume.edit import dilate
 
-# Shares of the seconds or steps of the whole fit: one in one piece comes to its finest lattice as late, earlier if that is a level more.
-COARSE_SHARE, SHARE_OF_FINER = 0.55, 0.35
+COARSE_SHARE = 0.55  # of the seconds or steps of the whole fit: with 0.35 cells have more of them, and are not better (a house)
 LEAST_RESOLUTION = 32  # of a coarse field
 PIXELS_A_CELL = 8_000_000  # of training images, where the number of cells is chosen (`auto`)
 # Memory of a cell's fit: libraries, kernels and the coarse field; a value of a lattice corner, with what Adam keeps of it.
@@ -95,16 +94,10 @@ def coarse_resolution(views: Views, scene: Scene, settings: Settings) -> int:
     return max(LEAST_RESOLUTION, finest // (COARSER * BLOCK * 2) * BLOCK * 2)
 
 
-def coarse_share(resolution: int) -> float:
-    """Of a fit, what a coarse field of that lattice takes."""
-    return SHARE_OF_FINER if COARSER * resolution >= FINER else COARSE_SHARE
-
-
 def coarse_settings(settings: Settings, resolution: int) -> Settings:
     """The settings of the coarse field's fit."""
-    fit, share = settings.fit, coarse_share(resolution)
-    seconds = share * (fit.budget or DEFAULT_BUDGET)
-    steps = None if fit.iterations is None else max(1, round(share * fit.iterations))
+    fit, seconds = settings.fit, COARSE_SHARE * (settings.fit.budget or DEFAULT_BUDGET)
+    steps = None if fit.iterations is None else max(1, round(COARSE_SHARE * fit.iterations))
     return replace(settings, field=replace(settings.field, resolution=resolution), fit=replace(fit, budget=seconds, iterations=steps))
 
 
@@ -157,8 +150,7 @@ def write_scene(folder: Path, key: str, result: FitResult, scene: Scene, setting
         region = int(region_mask(coarse, cells, cell, coarse.resolution, COARSER * coarse.resolution).sum())
         corners = COARSER**3 * region * CORNER_BYTES * (coarse.feature_rows.shape[1] + 1)
         memory.append(BASE + 2 * sum(values.nbytes for values in arrays.values()) + corners)
-    left = 1 - coarse_share(coarse.resolution)
-    parts = [left * size / sum(sizes) for size in sizes]
+    parts = [(1 - COARSE_SHARE) * size / sum(sizes) for size in sizes]
     # What a fit in one piece would have on this machine: cells have one thread each, however many are fitted side by side.
     budget, steps = (settings.fit.budget or DEFAULT_BUDGET) * (settings.threads or torch.get_num_threads()), settings.fit.iterations
     plan = ScenePlan(
@@ -263,7 +255,7 @@ def fit_cell_of(argument: tuple[str, int], progress: Progress, ticks: Callable[[
     of_cell = CellPlan(
         cell=cell,
         rays_before=plan.rays_before,
-        done_before=coarse_share(coarse.resolution),
+        done_before=COARSE_SHARE,
         share=plan.shares[cell],
         seconds=plan.seconds[cell],
         steps=None if plan.steps is None else plan.steps[cell],
