@@ -33,7 +33,7 @@ from fieldfuse.files import read_json
 from fieldfuse.pipelines.console import make_progress
 from fieldfuse.pipelines.options import Quiet
 from fieldfuse.progress import Progress
-from fieldfuse.training.cells.scene import PIXELS_A_CELL, COARSE_SHARE
+from fieldfuse.training.cells.scene import COARSE_SHARE, PIXELS_A_CELL
 from fieldfuse.volume.topology import BLOCK, MAX_TABLE_CELLS
 
 NOTHING = 2000  # tasks that do nothing, to see what a task costs
