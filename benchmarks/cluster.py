@@ -93,8 +93,7 @@ class Bench:
             if way != WAYS[-1]:
                 execute(words)
                 return found(folder)
-            with Store(cluster.address) as store:  # only here: to look takes seconds
-                threading.Thread(target=replace_node, args=(cluster, folder / "cells"), daemon=True).start()
+            with Store(cluster.address) as store, replacing_a_node(cluster, folder / "cells"):  # only here: to look takes seconds
                 execute(words)
             return {**found(folder), "store_mb": store.most}
 
@@ -122,13 +121,26 @@ def nodes(count: int) -> Iterator[Any]:
         made.shutdown()
 
 
-def replace_node(cluster: Any, folder: Path) -> None:
-    """Once two cells are fitted, take the second node away; a little later add another one."""
-    while len(list(folder.glob("cell-*.json"))) < 2:
-        time.sleep(EVERY)
-    cluster.remove_node(sorted(cluster.worker_nodes, key=str)[0], allow_graceful=False)
-    time.sleep(3 * EVERY)
-    cluster.add_node(**NODE)
+@contextmanager
+def replacing_a_node(cluster: Any, folder: Path) -> Iterator[None]:
+    """Once two cells are fitted, the second node is taken away; a little later another one is added."""
+    over = threading.Event()
+
+    def replace() -> None:
+        while len(list(folder.glob("cell-*.json"))) < 2:
+            if over.wait(EVERY):
+                return
+        cluster.remove_node(next(iter(cluster.worker_nodes)), allow_graceful=False)
+        over.wait(3 * EVERY)
+        cluster.add_node(**NODE)
+
+    thread = threading.Thread(target=replace, daemon=True)
+    thread.start()
+    try:
+        yield
+    finally:
+        over.set()
+        thread.join()
 
 
 class Store:
