@@ -69,7 +69,7 @@ def test_storage_that_a_node_does_not_see_is_named(connected: Workers, tmp_path:
         yield out / "not there"
 
     monkeypatch.setattr(on_ray, "probe", elsewhere)
-    with pytest.raises(InputError, match=rf"^the node \S+ does not see {tmp_path}; choose a folder on storage"):
+    with pytest.raises(InputError, match=rf"^the node \S+ does not see {tmp_path}; put it on storage that all nodes mount"):
         connected.check(tmp_path)
 
 
