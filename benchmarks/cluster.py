@@ -16,7 +16,8 @@ import re
 import subprocess
 import sys
 import threading
-from collections.abc import Iterator
+import time
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
@@ -92,18 +93,21 @@ class Bench:
             if way != WAYS[-1]:
                 execute(words)
                 return found(folder)
-            with Store(cluster.address) as store, replacing_a_node(cluster, folder / "cells"):  # only here: to look takes seconds
-                execute(words)
+            with Store(cluster.address) as store:  # only here: to look takes seconds
+                execute(words, lambda process: replace_node(process, cluster, folder / "cells"))
             return {**found(folder), "store_mb": store.most}
 
     def words(self, folder: Path, options: list[str]) -> list[str]:
         return [sys.executable, "-m", "fieldfuse", "run", str(self.capture), "--out", str(folder), *options]
 
 
-def execute(words: list[str]) -> None:
-    answer = subprocess.run(words, capture_output=True, text=True, check=False)
-    if answer.returncode:
-        raise InputError(f"{' '.join(words[3:6])} ended with exit code {answer.returncode}: {answer.stderr[-500:]}")
+def execute(words: list[str], meanwhile: Callable[[subprocess.Popen[str]], None] | None = None) -> None:
+    process = subprocess.Popen(words, stdout=subprocess.DEVNULL, stderr=subprocess.PIPE, text=True)
+    if meanwhile is not None:
+        meanwhile(process)
+    _, said = process.communicate()
+    if process.returncode:
+        raise InputError(f"{' '.join(words[3:6])} ended with exit code {process.returncode}: {said[-500:]}")
 
 
 @contextmanager
@@ -120,26 +124,15 @@ def nodes(count: int) -> Iterator[Any]:
         made.shutdown()
 
 
-@contextmanager
-def replacing_a_node(cluster: Any, folder: Path) -> Iterator[None]:
-    """Once two cells are fitted, the second node is taken away; a little later another one is added."""
-    over = threading.Event()
-
-    def replace() -> None:
-        while len(list(folder.glob("cell-*.json"))) < 2:
-            if over.wait(EVERY):
-                return
-        cluster.remove_node(next(iter(cluster.worker_nodes)), allow_graceful=False)
-        over.wait(3 * EVERY)
-        cluster.add_node(**NODE)
-
-    thread = threading.Thread(target=replace, daemon=True)
-    thread.start()
-    try:
-        yield
-    finally:
-        over.set()
-        thread.join()
+def replace_node(process: subprocess.Popen[str], cluster: Any, folder: Path) -> None:
+    """Once two cells are fitted, the second node is taken away; a little later another one is added. (Ray adds none from a thread.)"""
+    while len(list(folder.glob("cell-*.json"))) < 2:
+        if process.poll() is not None:
+            return
+        time.sleep(EVERY)
+    cluster.remove_node(next(iter(cluster.worker_nodes)), allow_graceful=False)
+    time.sleep(3 * EVERY)
+    cluster.add_node(**NODE)
 
 
 class Store:
