@@ -1,19 +1,20 @@
 """`python -m benchmarks.scale --measured DIR`: what 10,000 captures, and a site of a square kilometre, would take. Simulated, not run.
 
 Measured are the costs of a run of a batch, of a cell and of a pixel (by `benchmarks.batch` and `benchmarks.cells` with `--out DIR`), and
-of a task that does nothing (here). Everything else is assumed: the constants below. Tasks are put on cores as these become free, the
-machine that starts them takes its time for each, and nodes are lost now and then.
+of a task that does nothing and of a report (here; processor time of this process and all of Ray's). Everything else is assumed: the
+constants below. Tasks are put on cores as these become free, the machine that starts them takes its time for each, and nodes are lost now
+and then.
 """
 
 from __future__ import annotations
 
 import heapq
 import math
-import time
 from pathlib import Path
 from typing import Annotated, Any
 
 import numpy as np
+import psutil
 import typer
 
 from benchmarks.experiment import (
@@ -26,17 +27,16 @@ from benchmarks.experiment import (
     section,
     show,
 )
-from fieldfuse.cluster import Task, has_ray, open_workers
+from fieldfuse.cluster import Link, Task, has_ray, open_workers
 from fieldfuse.cluster.tasks import LISTEN
 from fieldfuse.errors import InputError
 from fieldfuse.files import read_json
 from fieldfuse.pipelines.console import make_progress
 from fieldfuse.pipelines.options import Quiet
-from fieldfuse.progress import Progress
 from fieldfuse.training.cells.scene import COARSE_SHARE, PIXELS_A_CELL
 from fieldfuse.volume.topology import BLOCK, MAX_TABLE_CELLS
 
-NOTHING = 2000  # tasks that do nothing, to see what a task costs
+NOTHING = 2000  # tasks that do nothing, and reports of one task, to see what these cost
 NODES = (10, 100, 500)
 CORES = 16  # of a node; a run or a cell has one
 DAYS_TO_FAILURE = 10.0  # of a node, the mean
@@ -67,7 +67,7 @@ def run(
     if not has_ray():
         raise InputError('this benchmark needs the package ray; install it (pip install "fieldfuse[cluster]")')
     progress = make_progress(quiet)
-    costs = {**fitted(measured), "task": a_task()}
+    costs = {**fitted(measured), **of_the_head()}
     plan: list[Row] = [{"what": what, "nodes": count} for what in ROWS for count in NODES]
     experiment = Experiment("scale", plan, lambda entry: ROWS[entry["what"]](entry["nodes"], costs), table, about={"costs": costs})
     show(section(experiment.conduct(out, progress, 1), table), quiet)
@@ -86,20 +86,34 @@ def fitted(folder: Path) -> dict[str, float]:
     }
 
 
-def nothing(_: Any, __: Progress) -> None:
-    """A task that only shows what a task costs."""
+def talk(reports: int, link: Link) -> None:
+    """A task that does nothing but report."""
+    for number in range(reports):
+        link.report({"done": number, "total": reports})
 
 
-def a_task() -> float:
-    """Seconds of the machine that starts them, for a task that does nothing."""
-    tasks = [Task(str(number), number) for number in range(NOTHING)]
+def of_the_head() -> dict[str, float]:
+    """Processor seconds for a task that does nothing, and for a report of one; all that Ray does for it is counted, wherever."""
     with open_workers(cpus=1) as workers:
-        for _ in workers.run(nothing, tasks[:8]):
-            pass  # workers are there now
-        began = time.monotonic()
-        for _ in workers.run(nothing, tasks):
+        for _ in workers.run(talk, [Task("first", 1)]):
+            pass  # a worker is there now
+        begun = _processor_times()
+        for _ in workers.run(talk, [Task(str(number), 0) for number in range(NOTHING)]):
             pass
-        return (time.monotonic() - began) / NOTHING
+        between = _processor_times()
+        for _ in workers.run(talk, [Task("talking", NOTHING)]):
+            pass
+        return {"task": _spent(begun, between) / NOTHING, "report": _spent(between, _processor_times()) / NOTHING}
+
+
+def _processor_times() -> dict[int, float]:
+    this = psutil.Process()
+    times = {one.pid: one.cpu_times() for one in (this, *this.children(recursive=True))}
+    return {pid: time.user + time.system for pid, time in times.items()}
+
+
+def _spent(before: dict[int, float], after: dict[int, float]) -> float:
+    return sum(seconds - before.get(pid, 0.0) for pid, seconds in after.items())
 
 
 def simulated(work: list[float], slots: int, before: float, a_task: float) -> tuple[float, int]:
@@ -124,7 +138,7 @@ def many_captures(nodes: int, costs: dict[str, float]) -> Row:
     slots = nodes * CORES
     work = np.random.default_rng(1).lognormal(math.log(CORE_SECONDS), SPREAD, CAPTURES).tolist()
     end, losses = simulated(work, slots, costs["run"], costs["task"])
-    reports = min(slots, CAPTURES) / LISTEN * costs["task"]  # each run reports as often, and a report is a call like a task
+    reports = min(slots, CAPTURES) / LISTEN * costs["report"]
     return {"hours": end / HOUR, "core_hours": sum(work) / HOUR, "used": sum(work) / (end * slots), "lost": losses, "head": reports}
 
 
@@ -137,7 +151,7 @@ def large_site(nodes: int, costs: dict[str, float]) -> Row:
     voxel = (SIDE**2 * HEIGHT / MAX_TABLE_CELLS) ** (1 / 3) / BLOCK  # the table of blocks is a box
     memory = f"{pixels * costs['pixel_bytes'] / 1e9:.0f} GB of memory"
     remarks = f"{count:,} cells; coarse fit {coarse / HOUR:.1f} h, {memory}; voxels ≥ {100 * voxel:.0f} cm"
-    whole, reports = coarse + end, min(slots, count) / LISTEN * costs["task"]
+    whole, reports = coarse + end, min(slots, count) / LISTEN * costs["report"]
     used = seconds / (whole * slots)
     return {"hours": whole / HOUR, "core_hours": seconds / HOUR, "used": used, "lost": losses, "head": reports, "remarks": remarks}
 
@@ -149,8 +163,9 @@ def table(data: Row) -> str:
     """Markdown: what was measured, and a line a simulation."""
     costs = data["costs"]
     known = (
-        f"Measured: {costs['run']:.2f} s beside each run, {costs['cell']:.2f} s for each cell, {1e3 * costs['task']:.1f} ms of the head "
-        f"for a task, {1e6 * costs['pixel']:.2f} core seconds and {costs['pixel_bytes']:.1f} MB for a million pixels."
+        f"Measured: {costs['run']:.2f} s beside each run, {costs['cell']:.2f} s for each cell, of the head {1e3 * costs['task']:.1f} ms "
+        f"for a task and {1e3 * costs['report']:.1f} ms for a report, "
+        f"{1e6 * costs['pixel']:.2f} core seconds and {costs['pixel_bytes']:.1f} MB for a million pixels."
     )
     return known + "\n\n" + markdown(list(TITLES.values()), [[_cell(name, row.get(name, "")) for name in TITLES] for row in data["rows"]])
 
