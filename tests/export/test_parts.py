@@ -31,7 +31,7 @@ from tests.export.test_page import FIELDS, POSES, drawn, seen, slow_values, tour
 from tests.export.test_page_tools import HEADSET
 from tests.render.made import coloured_field, random_field
 
-SLOWEST = 120.0  # seconds that a page may take on a busy machine
+SLOWEST = 240.0  # seconds that a page may take on a busy machine
 WEB = Path(pages.__file__).with_name("web")
 
 
