@@ -1,181 +1,186 @@
-"""`python -m benchmarks.scale --measured DIR`: what 10,000 captures, and a site of a square kilometre, would take. Simulated, not run.
+"""`python -m benchmarks.scale`: how exact metres are that markers, measured distances and GPS give to structure from motion.
 
-Measured are the costs of a run of a batch, of a cell and of a pixel (by `benchmarks.batch` and `benchmarks.cells` with `--out DIR`), and
-of a task that does nothing and of a report (here; processor time of this process and all of Ray's). Everything else is assumed: the
-constants below. Tasks are put on cores as these become free, the machine that starts them takes its time for each, and nodes are lost now
-and then.
+Simulated captures of which nothing but the images is used; the truth is where their cameras stood.
 """
 
 from __future__ import annotations
 
-import heapq
-import math
+import tempfile
 from pathlib import Path
 from typing import Annotated, Any
 
+import cv2
 import numpy as np
-import psutil
+import torch
 import typer
+from safetensors.numpy import load_file
 
-from benchmarks.experiment import (
-    Experiment,
-    Folder,
-    Row,
-    application,
-    markdown,
-    program,
-    section,
-    show,
-)
-from fieldfuse.cluster import Link, Task, has_ray, open_workers
-from fieldfuse.cluster.tasks import LISTEN
+from benchmarks.experiment import Experiment, Folder, Row, application, markdown, program, section, show
+from fieldfuse import steps
+from fieldfuse.camera import Array, Intrinsics, unproject
+from fieldfuse.capture.images import load_image
+from fieldfuse.capture.types import Capture
+from fieldfuse.config import PosesSettings, load_settings
+from fieldfuse.effects.effect_specs import parse
 from fieldfuse.errors import InputError
 from fieldfuse.files import read_json
 from fieldfuse.pipelines.console import make_progress
-from fieldfuse.pipelines.options import Quiet
-from fieldfuse.training.cells.scene import COARSE_SHARE, PIXELS_A_CELL
-from fieldfuse.volume.topology import BLOCK, MAX_TABLE_CELLS
+from fieldfuse.pipelines.options import Quiet, Threads
+from fieldfuse.poses.gps import similarity
+from fieldfuse.poses.result import PoseResult
+from fieldfuse.poses.scaling import find_scaling
+from fieldfuse.progress import SILENT, Progress
+from fieldfuse.simulate.eye import Rays
+from fieldfuse.simulate.settings import scene_file
+from fieldfuse.simulate.simulate import prepare, simulate
 
-NOTHING = 2000  # tasks that do nothing, and reports of one task, to see what these cost
-NODES = (10, 100, 500)
-CORES = 16  # of a node; a run or a cell has one
-DAYS_TO_FAILURE = 10.0  # of a node, the mean
-AGAIN = 0.5  # of what a task has done when its node is lost is done again: one stage of a run; a cell begins anew, but half-way on average
-CAPTURES, CORE_SECONDS, SPREAD = 10_000, 300.0, 0.5  # runs, the median of their work, its deviation in natural logarithms
-PICTURES, MEGAPIXELS = 10_000, 2.0  # of the site
-SIDE, HEIGHT = 1000.0, 20.0  # metres: the site, and what stands on it
-THREADS = 0.6  # of the speed of one thread is that of each of a node's, in the coarse fit
-HOUR = 3600.0
-TITLES = {
-    "what": "",
-    "nodes": "nodes",
-    "hours": "hours",
-    "core_hours": "core hours of work",
-    "used": "of all cores' time",
-    "lost": "tasks that lost their node",
-    "head": "cores that the head needs",
-    "remarks": "",
+SIDE = 0.1  # metres, of the markers
+PAIRS = 5  # distances that are measured, each alone
+LOW, ROUND, ABOVE = -0.118, 0.095, 0.02  # metres: plates' height over the focus; their corners from their middles; free space about them
+REACH, FEWEST = np.arange(0.14, 0.4, 0.03), 6  # metres from the table's middle; cameras that must see a whole plate
+EVEN, PATCH, APART = 0.1, 12, 0.2  # marks lie on surfaces without an edge within some pixels, and far enough from each other (metres)
+SCENES: dict[str, dict[str, Any]] = {
+    "table": {
+        "camera": {"width": 960, "height": 720},  # markers are 25 to 55 pixels wide
+        "path": {"kind": "orbit", "fps": 5, "speed": 0.9},
+        "markers": [{"side": SIDE, "number": 3}, {"side": SIDE, "number": 7, "turn": 30}],  # `laid` says where
+        "gps": {"noise": 0.02, "noise_up": 0.03},
+    },
+    "street": {"path": {"kind": "fly", "fps": 2, "speed": 1.2}, "effects": ["background"], "gps": {"noise": 0.05, "noise_up": 0.08}},
 }
+WAYS = ("marker", "distance", "gps")
+TITLES = {"scene": "scene", "seed": "seed", "images": "images placed", "marker": "markers", "distance": "a distance", "gps": "GPS"}
 
 
-def run(
-    measured: Annotated[Path, typer.Option(help="Folder with batch.json and cells.json of those benchmarks.")],
+def scale(
+    frames: Annotated[int, typer.Option(min=8, max=200, help="Images of a capture.")] = 30,
+    seeds: Annotated[int, typer.Option(min=1, max=20, help="Captures of each scene.")] = 3,
+    scenes: Annotated[str, typer.Option(help="Some of table, street; separated by commas.")] = "table,street",
+    threads: Threads = None,
     out: Folder = None,
     quiet: Quiet = False,
 ) -> None:
-    """Fit the model to what was measured, and simulate."""
-    if not has_ray():
-        raise InputError('this benchmark needs the package ray; install it (pip install "fieldfuse[cluster]")')
+    """Simulate captures, find their poses, and compare the unit of length that each way gives with the true one."""
+    names = [name.strip() for name in scenes.split(",")]
+    if unknown := [name for name in names if name not in SCENES]:
+        raise InputError(f"there is no scene {unknown[0]!r} here; known are {', '.join(SCENES)}")
     progress = make_progress(quiet)
-    costs = {**fitted(measured), **of_the_head()}
-    plan: list[Row] = [{"what": what, "nodes": count} for what in ROWS for count in NODES]
-    experiment = Experiment("scale", plan, lambda entry: ROWS[entry["what"]](entry["nodes"], costs), table, about={"costs": costs})
-    show(section(experiment.conduct(out, progress, 1), table), quiet)
+    plan = [{"scene": name, "seed": seed, "frames": frames} for name in names for seed in range(seeds)]
 
+    def run(entry: Row) -> Row:
+        with tempfile.TemporaryDirectory(prefix="fieldfuse-scale-") as folder:
+            return measured(Path(folder), entry["scene"], entry["seed"], entry["frames"], progress)
 
-def fitted(folder: Path) -> dict[str, float]:
-    """Seconds of a core, beside the work itself, for each run of a batch and for each cell; core seconds, and bytes, of a pixel."""
-    batch, rows = read_json(folder / "batch.json")["rows"][0], read_json(folder / "cells.json")["rows"]
-    cells, whole = ({row["way"]: row for row in rows}[way] for way in ("cells", "one piece"))
-    pixels = 1e6 * whole["megapixels"]
-    return {
-        "run": batch["beside"] / batch["captures"],
-        "cell": (cells["seconds"] - cells["budget"]) / cells["cells"],
-        "pixel": whole["budget"] / pixels,
-        "pixel_bytes": 1e6 * whole["memory_mb"] / pixels,
-    }
-
-
-def talk(reports: int, link: Link) -> None:
-    """A task that does nothing but report."""
-    for number in range(reports):
-        link.report({"done": number, "total": reports})
-
-
-def of_the_head() -> dict[str, float]:
-    """Processor seconds for a task that does nothing, and for a report of one; all that Ray does for it is counted, wherever."""
-    with open_workers(cpus=1) as workers:
-        for _ in workers.run(talk, [Task("first", 1)]):
-            pass  # a worker is there now
-        begun = _processor_times()
-        for _ in workers.run(talk, [Task(str(number), 0) for number in range(NOTHING)]):
-            pass
-        between = _processor_times()
-        for _ in workers.run(talk, [Task("talking", NOTHING)]):
-            pass
-        return {"task": _spent(begun, between) / NOTHING, "report": _spent(between, _processor_times()) / NOTHING}
-
-
-def _processor_times() -> dict[int, float]:
-    this = psutil.Process()
-    times = {one.pid: one.cpu_times() for one in (this, *this.children(recursive=True))}
-    return {pid: time.user + time.system for pid, time in times.items()}
-
-
-def _spent(before: dict[int, float], after: dict[int, float]) -> float:
-    return sum(seconds - before.get(pid, 0.0) for pid, seconds in after.items())
-
-
-def simulated(work: list[float], slots: int, before: float, a_task: float) -> tuple[float, int]:
-    """Seconds until the last of some tasks ends, and how many lost their node.
-
-    Args:
-        work: seconds of each. before: seconds before each on its core. a_task: seconds of the head for each, one after the other.
-    """
-    random, free, losses, head, end = np.random.default_rng(0), [0.0] * slots, 0, 0.0, 0.0
-    for seconds in work:
-        head = max(head, free[0]) + a_task
-        took, left = before + seconds, random.exponential(DAYS_TO_FAILURE * 24 * HOUR)
-        if left < took:
-            losses, took = losses + 1, took + AGAIN * left
-        end = max(end, done := max(heapq.heappop(free), head) + took)
-        heapq.heappush(free, done)
-    return end, losses
-
-
-def many_captures(nodes: int, costs: dict[str, float]) -> Row:
-    """`CAPTURES` runs."""
-    slots = nodes * CORES
-    work = np.random.default_rng(1).lognormal(math.log(CORE_SECONDS), SPREAD, CAPTURES).tolist()
-    end, losses = simulated(work, slots, costs["run"], costs["task"])
-    reports = min(slots, CAPTURES) / LISTEN * costs["report"]
-    return {"hours": end / HOUR, "core_hours": sum(work) / HOUR, "used": sum(work) / (end * slots), "lost": losses, "head": reports}
-
-
-def large_site(nodes: int, costs: dict[str, float]) -> Row:
-    """The site: its coarse fit on one node, then its cells on all."""
-    pixels, slots = 1e6 * PICTURES * MEGAPIXELS, nodes * CORES
-    count, seconds = round(pixels / PIXELS_A_CELL), pixels * costs["pixel"]
-    coarse = COARSE_SHARE * seconds / (CORES * THREADS)
-    end, losses = simulated([(1 - COARSE_SHARE) * seconds / count] * count, slots, costs["cell"], costs["task"])
-    voxel = (SIDE**2 * HEIGHT / MAX_TABLE_CELLS) ** (1 / 3) / BLOCK  # the table of blocks is a box
-    memory = f"{pixels * costs['pixel_bytes'] / 1e9:.0f} GB of memory"
-    remarks = f"{count:,} cells; coarse fit {coarse / HOUR:.1f} h, {memory}; voxels ≥ {100 * voxel:.0f} cm"
-    whole, reports = coarse + end, min(slots, count) / LISTEN * costs["report"]
-    used = seconds / (whole * slots)
-    return {"hours": whole / HOUR, "core_hours": seconds / HOUR, "used": used, "lost": losses, "head": reports, "remarks": remarks}
-
-
-ROWS = {f"{CAPTURES:,} captures": many_captures, "1 km²": large_site}
+    show(section(Experiment("scale", plan, run, table).conduct(out, progress, threads), table), quiet)
 
 
 def table(data: Row) -> str:
-    """Markdown: what was measured, and a line a simulation."""
-    costs = data["costs"]
-    known = (
-        f"Measured: {costs['run']:.2f} s beside each run, {costs['cell']:.2f} s for each cell, of the head {1e3 * costs['task']:.1f} ms "
-        f"for a task and {1e3 * costs['report']:.1f} ms for a report, "
-        f"{1e6 * costs['pixel']:.2f} core seconds and {costs['pixel_bytes']:.1f} MB for a million pixels."
-    )
-    return known + "\n\n" + markdown(list(TITLES.values()), [[_cell(name, row.get(name, "")) for name in TITLES] for row in data["rows"]])
+    """Markdown: a line a capture; errors in percent, and what was stated."""
+    titles = [f"{title}, error (stated)" if name in WAYS else title for name, title in TITLES.items()]
+    return markdown(titles, map(_line, data["rows"]))
 
 
-def _cell(name: str, value: Any) -> str:
-    if name == "used":
-        return f"{value:.0%}"
-    return f"{value:,.1f}" if isinstance(value, float) else str(value)
+def _line(row: Row) -> list[str]:
+    ways = [f"{abs(row[way]['error']):.2f}% ({row[way]['stated']:.2f}%)" if row.get(way) else "–" for way in WAYS]
+    return [row["scene"], str(row["seed"]), f"{row['placed']} of {row['frames']}", *ways]
 
 
-app = application(run)
+def measured(folder: Path, scene: str, seed: int, frames: int, progress: Progress = SILENT) -> Row:
+    """Errors of the unit of length in percent by each way that the scene has, and those that were stated."""
+    settings, setup = load_settings(), SCENES[scene]
+    filmed = {**setup, "scene": scene, "seed": seed, "output": "photos", "path": {**setup["path"], "frames": frames}}
+    if "markers" in setup:
+        filmed["markers"] = laid(filmed)
+    simulate(scene_file(filmed, "the benchmark"), folder / "capture", progress=progress)
+    capture = steps.read_capture(folder / "capture" / "images", folder, settings, progress)
+    poses = steps.camera_poses(capture, folder, settings, progress)
+    true = [entry["world_from_camera"] for entry in read_json(folder / "capture/ground_truth/cameras.json")["frames"]]
+    by_name = {frame.name: np.array(pose) for frame, pose in zip(capture.frames, true, strict=True)}
+    centres = np.array([by_name[name][:3, 3] for name in poses.names])
+    unit = similarity(poses.world_from_camera[:, :3, 3], centres).scale
+    row: Row = {"placed": len(poses.names)}
+    ways: dict[str, list[PosesSettings]] = {"gps": [PosesSettings()]}
+    if "markers" in setup:
+        ways["marker"] = [PosesSettings(marker=f"DICT_4X4_50:{SIDE}", gps="off")]
+    ways["distance"] = [PosesSettings(scale=text, gps="off") for text in distances(folder / "capture", capture, poses, by_name)]
+    for way, all_of in ways.items():
+        found = [found for one in all_of if (found := _error(capture, poses, one, unit)) is not None]
+        if found:  # of several distances, each alone, the median
+            error, stated = np.median(np.abs(np.array(found)), axis=0)
+            row[way] = {"error": round(float(error), 4), "stated": round(float(stated), 4), "each": [round(one[0], 4) for one in found]}
+    return row
+
+
+def laid(filmed: Row) -> list[dict[str, Any]]:
+    """A table's markers as a person lays them: flat, on spots where nothing stands, and where most of the cameras see them whole.
+
+    Raises:
+        InputError: the table has too few such spots.
+    """
+    bare = scene_file({**filmed, "markers": []}, "the benchmark")
+    film = prepare(bare, Path(), parse(bare.effects, "the effects"))
+    scene, eyes = film.scene, film.world_from_camera[:, :3, 3]
+    around = np.linspace(0, 2 * np.pi, 16, endpoint=False)
+    plate = np.array([[0.0, 0.0, LOW], *([part * np.cos(a), part * np.sin(a), LOW] for part in (0.5 * ROUND, ROUND) for a in around)])
+    found = list[tuple[int, Array]]()
+    for angle in np.linspace(0, 2 * np.pi, 24, endpoint=False):
+        for reach in REACH:
+            spot = np.array([reach * np.cos(angle), reach * np.sin(angle), 0.0])
+            points = np.asarray(scene.focus) + spot + plate
+            near = scene.clearance(torch.from_numpy(points + np.array([0, 0, ABOVE])).float()).cpu().numpy()
+            if np.abs(near - ABOVE).max() > 0.005:  # something stands there, or the table ends
+                continue
+            ways = points[None] - eyes[:, None]
+            lengths = np.linalg.norm(ways, axis=-1)
+            starts, ways = np.repeat(eyes, len(plate), axis=0), (ways / lengths[..., None]).reshape(-1, 3)
+            rays = Rays(torch.from_numpy(starts).float(), torch.from_numpy(ways).float(), 0.0)
+            seen = scene.see(rays).distance.cpu().numpy().reshape(lengths.shape)
+            found.append((int((seen > lengths - 0.01).all(axis=1).sum()), spot))
+    spots = list[Array]()
+    for views, spot in sorted(found, key=lambda one: -one[0]):
+        if views >= FEWEST and all(np.linalg.norm(spot - other) > 2 * ROUND for other in spots):
+            spots.append(spot)
+    if len(spots) < len(filmed["markers"]):
+        raise InputError(f"seed {filmed['seed']}: the table has {len(spots)} free spots in view for {len(filmed['markers'])} markers")
+    return [{**marker, "at": [*spot[:2].tolist(), LOW]} for marker, spot in zip(filmed["markers"], spots, strict=False)]
+
+
+def _error(capture: Capture, poses: PoseResult, settings: PosesSettings, unit: float) -> tuple[float, float] | None:
+    """Of the scale in percent, true and stated; None: none was found."""
+    try:
+        found = find_scaling(capture, poses, settings)
+    except InputError:
+        return None
+    return None if found.facts is None else (100 * (found.move.scale / unit - 1), 100 * found.facts["error"])
+
+
+def distances(root: Path, capture: Capture, poses: PoseResult, by_name: dict[str, Array]) -> list[str]:
+    """Measured distances between points in two images each, as a person would mark them: on corners of what has texture."""
+    count, found = len(poses.names), list[str]()
+    lens = Intrinsics.from_dict(read_json(root / "ground_truth/cameras.json")["intrinsics"])
+    for number in range(PAIRS):
+        texts, ends = list[str](), list[Array]()
+        for index in (count // 4 + number, count // 2 + number):
+            name = poses.names[min(index, count - 1)]
+            frame = next(frame for frame in capture.frames if frame.name == name)
+            image = cv2.cvtColor(load_image(frame)[..., :3], cv2.COLOR_RGB2GRAY)
+            depth = load_file(root / f"ground_truth/frames/{frame.image.stem}.safetensors")["depth"]
+            for x, y in np.asarray(cv2.goodFeaturesToTrack(image[60:-60, 60:-60], 60, 0.05, 30)).reshape(-1, 2)[number:] + 60.5:
+                column, row = int(x), int(y)
+                near = depth[row - PATCH : row + PATCH + 1, column - PATCH : column + PATCH + 1]
+                if depth[row, column] <= 0 or np.ptp(near) > EVEN * depth[row, column]:
+                    continue
+                end = unproject(lens, by_name[name], np.array([[x, y]]), depth[row, column][None].astype(np.float64))[0]
+                if ends and np.linalg.norm(end - ends[0]) < APART:
+                    continue
+                texts.append(f"{name}:{x:.1f},{y:.1f}")
+                ends.append(end)
+                break
+        if len(ends) == 2:
+            found.append(f"{texts[0]} {texts[1]} = {float(np.linalg.norm(ends[0] - ends[1])):.6f}")
+    return found
+
+
+app = application(scale)
 if __name__ == "__main__":
     program(app)

@@ -1,4 +1,4 @@
-"""Features and matches by tasks: those that one machine finds, whoever finds them, also where workers die and runs are interrupted."""
+"""Features and matches by tasks are those that one machine finds, also where workers die and runs are interrupted."""
 
 from __future__ import annotations
 

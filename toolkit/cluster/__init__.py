@@ -1,6 +1,6 @@
 """Functions as tasks on the machines of a Ray cluster, on a pool of Ray's on this one, or in this process: one interface for the three.
 
-    def square(number, link):                   # link: a Progress, through which a task is reader and stopped
+    def square(number, link):                   # link: a Progress, through which a task is heard and stopped
         link.update(1, 1, "squared")
         return number**2
 

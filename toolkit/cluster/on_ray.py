@@ -103,7 +103,7 @@ class Cluster(Workers):
         from ray.util.scheduling_strategies import NodeAffinitySchedulingStrategy
 
         here = NodeAffinitySchedulingStrategy(self.ray.get_runtime_context().get_node_id(), soft=False)
-        lasting = {"max_restarts": -1, "max_task_retries": -1}  # whatever is killed, tasks can be reader
+        lasting = {"max_restarts": -1, "max_task_retries": -1}  # whatever is killed, tasks can be heard
         board = self.ray.remote(_Board).options(num_cpus=0, scheduling_strategy=here, **lasting).remote()
         remote = self.ray.remote(_on_node)
         left = {}
