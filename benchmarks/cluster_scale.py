@@ -1,6 +1,5 @@
 """`python -m benchmarks.cluster_scale --measured DIR`: what 10,000 captures, and a site of a square kilometre, would take. Simulated.
 
-
 Measured are the costs of a run of a batch, of a cell and of a pixel (by `benchmarks.batch` and `benchmarks.cells` with `--out DIR`), and
 of a task that does nothing and of a report (here; processor time of this process and all of Ray's). Everything else is assumed: the
 constants below. Tasks are put on cores as these become free, the machine that starts them takes its time for each, and nodes are lost now

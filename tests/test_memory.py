@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import errno
 import mmap
 import os
 import subprocess
@@ -110,8 +111,14 @@ def test_pages_that_do_not_fit_into_memory_are_a_file_without_a_name(tmp_path: P
     assert len(memory.pages(2**30)) == 2**30  # memory, if it must be
     del values, buffer, fits
     assert not mapped(tmp_path)
+    monkeypatch.setattr(os, "posix_fallocate", full_disk)
+    assert len(memory.pages(2**23, spill=True)) == 2**23 and not mapped(tmp_path)  # memory, if that has room
     with pytest.raises(InputError, match=r"of memory or disk, and 0\.1 GB of memory and .* GB in .* are free; .* TMPDIR"):
         memory.pages(2**55, spill=True)
+
+
+def full_disk(*_: int) -> None:
+    raise OSError(errno.ENOSPC, "no space left")
 
 
 def resident() -> int:

@@ -169,14 +169,15 @@ def pages(size: int, spill: bool = False) -> mmap.mmap | bytearray:
             (TMPDIR), of which the system keeps in memory what is in use. It has no name and goes with the last reference.
 
     Raises:
-        InputError: they are to be a file, and the disk has no room for them.
+        InputError: neither memory nor disk has room for them.
     """
     if size == 0 or not hasattr(mmap, "MAP_PRIVATE"):
         return bytearray(size)
     if spill and size > IN_MEMORY * (available() - SPARE):
         require_place(size, "a field that does not fit into memory")
-        with tempfile.TemporaryFile() as file:
-            file.truncate(size)
+        with suppress(OSError, AttributeError), tempfile.TemporaryFile() as file:  # AttributeError: not every system has the call
+            # Without its blocks on the disk a write to a full one would end the process. Where there are too few it is memory after all.
+            os.posix_fallocate(file.fileno(), 0, size)
             return mmap.mmap(file.fileno(), size)
     out = mmap.mmap(-1, size, flags=mmap.MAP_PRIVATE | mmap.MAP_ANONYMOUS)
     if hasattr(mmap, "MADV_NOHUGEPAGE"):

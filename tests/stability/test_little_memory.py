@@ -107,20 +107,21 @@ def test_each_command_refuses_with_numbers_what_does_not_fit(name: str, finished
     assert what in sentence and "GB of memory and" in sentence and "is free; " in sentence, sentence
 
 
-def test_an_export_leaves_out_the_meshes_that_do_not_fit_and_says_so(finished: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(memory, "RENDER_BYTES", HUGE)
-    answer = fieldfuse("export", finished, "--formats", "obj,cameras", "--threads", "1", "--quiet", "--json")
+@pytest.mark.parametrize(
+    ("bytes_each", "wanted", "file", "said"),
+    [
+        ("RENDER_BYTES", "obj", "mesh.obj", "points and meshes were left out: rendering 3 pictures"),
+        ("SEEN_BYTES", "splat", "splat.ply", "the splats were left out: making splats of a field of"),
+    ],
+)
+def test_an_export_leaves_out_what_does_not_fit_and_says_so(
+    bytes_each: str, wanted: str, file: str, said: str, finished: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(memory, bytes_each, HUGE)
+    answer = fieldfuse("export", finished, "--formats", f"{wanted},cameras", "--threads", "1", "--quiet", "--json")
     assert answer.code == 0, answer
-    assert "points and meshes were left out: rendering 3 pictures" in answer.out and "GB is free" in answer.out
-    assert (finished / "exports" / "cameras" / "transforms.json").is_file() and not (finished / "exports" / "mesh.obj").is_file()
-
-
-def test_an_export_leaves_out_the_splats_that_do_not_fit_and_says_so(finished: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(memory, "SEEN_BYTES", HUGE)
-    answer = fieldfuse("export", finished, "--formats", "splat,cameras", "--threads", "1", "--quiet", "--json")
-    assert answer.code == 0, answer
-    assert "the splats were left out: making splats of a field of" in answer.out and "GB is free" in answer.out
-    assert (finished / "exports" / "cameras" / "transforms.json").is_file() and not (finished / "exports" / "splat.ply").is_file()
+    assert said in answer.out and "GB is free" in answer.out
+    assert (finished / "exports" / "cameras" / "transforms.json").is_file() and not (finished / "exports" / file).is_file()
 
 
 def test_prepared_pictures_that_do_not_fit_are_not_read(finished: Path, monkeypatch: pytest.MonkeyPatch) -> None:
