@@ -269,6 +269,25 @@ def test_what_cannot_be_loaded_stays_coarse(browser: Driven, served: str, tmp_pa
 
 
 @pytest.mark.usefixtures("small")
+def test_a_connection_that_is_lost_is_tried_again(browser: Driven, served: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    lost: list[str] = []
+
+    def lose_first(request: Quiet) -> None:
+        if request.path.endswith(INDEX) and len(lost) < 4:  # Chromium itself asks twice
+            lost.append(request.path)
+            request.close_connection = True  # without an answer
+        else:
+            http.server.SimpleHTTPRequestHandler.do_GET(request)
+
+    monkeypatch.setattr(Quiet, "do_GET", lose_first)
+    (written, *_) = write_page(tmp_path / "field.html", bake(large_field()), tour(), "sphere")
+    written.write_text(written.read_text().replace("const AGAIN = 30000;", "const AGAIN = 300;"))
+    opened(browser, served)
+    until(lambda: "cannot be reached just now" in "".join(browser.run("heard")), SLOWEST)
+    whole(browser)
+
+
+@pytest.mark.usefixtures("small")
 @pytest.mark.parametrize(
     ("text", "sentence"),
     [(None, "is not beside this page"), ('{"version": 1}', "belongs to another page"), ("{", "belongs to another page")],

@@ -7,7 +7,7 @@ const AT_ONCE = 2;  // parts that are on their way
 const AHEAD = 0.5;  // cosine to the direction of view of what is ahead …
 const BEHIND = 3;  // … and what is not counts as if it were so many times as far
 const STICKY = 1.2;  // a part goes for another that is nearer by this
-const AGAIN = 30000;  // milliseconds until a part that failed is asked for once more
+const AGAIN = 30000;  // milliseconds until what failed is asked for once more
 const SERVED = 'A coarse view of the whole scene: details load when this folder is served, as by `fieldfuse view DIR`.';
 const LISTS = {  // textures that grow: format, what of a part counts, entries and words of each
   slices: ['RGBA32UI', 'RGBA_INTEGER', 'blocks', 8, 4],
@@ -24,13 +24,19 @@ class Details {
     field.textures.children = this.list('R32I', this.children.length);
     this.shown();
     if (location.protocol === 'file:') this.say(SERVED);
-    else this.open().catch(error => { this.say(SERVED); brief(error.message); });
+    else this.start();
   }
+
+  start() { this.open().catch(error => { this.say(SERVED); brief(error.message); }); }
 
   say(text) { $('details').textContent = text; }
 
   async open() {
-    const answer = await fetch('field_parts/index.json', {cache: 'no-cache'}), {about, coarse} = this;
+    const answer = await fetch('field_parts/index.json', {cache: 'no-cache'}).catch(() => null), {about, coarse} = this;
+    if (!answer) {
+      setTimeout(() => this.start(), AGAIN);
+      throw new Error('The details cannot be reached just now: the page asks again in half a minute.');
+    }
     if (!answer.ok) throw new Error('The folder field_parts is not beside this page: what is shown stays coarse.');
     const index = await answer.json().catch(() => ({}));
     if (index.version !== 1 || index.field !== about.parts.field) throw new Error('The folder field_parts belongs to another page: what is shown stays coarse.');
