@@ -24,6 +24,7 @@ from fieldfuse.api import load
 from fieldfuse.camera import Array, pixel_grid, rays
 from fieldfuse.capture.types import Views
 from fieldfuse.config import Settings
+from fieldfuse.errors import InputError
 from fieldfuse.pipelines.console import make_progress
 from fieldfuse.pipelines.options import Quiet
 from fieldfuse.pipelines.stages import PeakMemory
@@ -83,12 +84,15 @@ class Bench:
     scene: Scene
     settings: Settings
     borders: tuple[Cells, int] | None = None  # of the cells, and how much finer the fields' lattice is than theirs
+    coarse_seconds: float = 0.0  # of the last fit in cells
 
     def row(self, way: str, folder: Path) -> Row:
         warm_up(self.settings, SILENT)
         field, seconds, memory = self.in_cells(folder) if way == "cells" else self.in_one_piece()
         lenses = [lens for lens, test in zip(self.views.intrinsics, self.views.test, strict=True) if not test]
         facts = {"seconds": round(seconds, 1), "memory_mb": round(memory), "voxels": field.voxels}
+        if way == "cells":
+            facts["coarse_seconds"] = round(self.coarse_seconds, 1)
         return {**self.scores(field), **facts, "megapixels": round(sum(lens.width * lens.height for lens in lenses) / 1e6, 2)}
 
     def in_one_piece(self) -> tuple[Field, float, float]:
@@ -98,12 +102,12 @@ class Bench:
         return result.field, watch.seconds, watch.megabytes
 
     def in_cells(self, folder: Path) -> tuple[Field, float, float]:
-        resolution = cells.coarse_resolution(self.views, self.scene, self.settings)
-        settings = cells.coarse_settings(self.settings, resolution)
         with Watch() as before:
             steps.set_seeds(self.settings.seed)
-            coarse = fit_guided(self.views, self.scene, settings, begin=Begin(host_for("cpu")), ticks=time.process_time)
-            plan = cells.write_scene(folder, "benchmark", coarse, self.scene, self.settings)
+            coarse = cells.fit_coarse(self.views, self.scene, self.settings, begin=Begin(host_for("cpu")), ticks=time.process_time)
+            if coarse.done == 1:
+                raise InputError("the budget is too small for cells; give more --budget")
+            plan = cells.write_scene(folder, "benchmark", coarse, self.scene, self.settings, ticks=time.process_time)
         watches = []
         for cell in range(plan.count):
             with Watch() as watch:
@@ -112,8 +116,8 @@ class Bench:
         with Watch() as after:
             field, _ = cells.merge_scene(folder, plan)
         _, known, _ = cells.coarse_of(folder, plan.key)
-        self.borders = known, plan.resolution // resolution
-        seconds = sum(watch.seconds for watch in (before, *watches, after))
+        self.borders = known, plan.resolution // coarse.field.resolution
+        seconds, self.coarse_seconds = sum(watch.seconds for watch in (before, *watches, after)), before.seconds
         return field, seconds, max(watch.megabytes for watch in watches)
 
     def scores(self, field: Field) -> Row:

@@ -24,7 +24,7 @@ from fieldfuse.errors import InputError
 from fieldfuse.files import read_json
 from fieldfuse.pipelines.console import make_progress
 from fieldfuse.pipelines.options import Quiet
-from fieldfuse.training.cells.scene import COARSE_SHARE, PIXELS_A_CELL
+from fieldfuse.training.cells.scene import PIXELS_A_CELL
 from fieldfuse.volume.topology import BLOCK, MAX_TABLE_CELLS
 
 NOTHING = 2000  # tasks that do nothing, and reports of one task, to see what these cost
@@ -65,13 +65,15 @@ def run(
 
 
 def fitted(folder: Path) -> dict[str, float]:
-    """Seconds of a core, beside the work itself, for each run of a batch and for each cell; core seconds, and bytes, of a pixel."""
+    """Seconds of a core, beside the work itself, for each run of a batch and for each cell; core seconds, and bytes, of a pixel; and the
+    coarse fit's share of a scene's seconds."""
     batch, rows = read_json(folder / "batch.json")["rows"][0], read_json(folder / "cells.json")["rows"]
     cells, whole = ({row["way"]: row for row in rows}[way] for way in ("cells", "one piece"))
     pixels = 1e6 * whole["megapixels"]
     return {
         "run": batch["beside"] / batch["captures"],
         "cell": (cells["seconds"] - cells["budget"]) / cells["cells"],
+        "coarse": cells["coarse_seconds"] / cells["budget"],
         "pixel": whole["budget"] / pixels,
         "pixel_bytes": 1e6 * whole["memory_mb"] / pixels,
     }
@@ -137,8 +139,8 @@ def large_site(nodes: int, costs: dict[str, float]) -> Row:
     """The site: its coarse fit on one node, then its cells on all."""
     pixels, slots = 1e6 * PICTURES * MEGAPIXELS, nodes * CORES
     count, seconds = round(pixels / PIXELS_A_CELL), pixels * costs["pixel"]
-    coarse = COARSE_SHARE * seconds / (CORES * THREADS)
-    end, losses = simulated([(1 - COARSE_SHARE) * seconds / count] * count, slots, costs["cell"], costs["task"])
+    coarse = costs["coarse"] * seconds / (CORES * THREADS)
+    end, losses = simulated([(1 - costs["coarse"]) * seconds / count] * count, slots, costs["cell"], costs["task"])
     voxel = (SIDE**2 * HEIGHT / MAX_TABLE_CELLS) ** (1 / 3) / BLOCK  # the table of blocks is a box
     memory = f"{pixels * costs['pixel_bytes'] / 1e9:.0f} GB of memory"
     remarks = f"{count:,} cells; coarse fit {coarse / HOUR:.1f} h, {memory}; voxels ≥ {100 * voxel:.0f} cm"
@@ -155,7 +157,7 @@ def table(data: Row) -> str:
     costs = data["costs"]
     known = (
         f"Measured: {costs['run']:.2f} s beside each run, {costs['cell']:.2f} s for each cell, of the head {1e3 * costs['task']:.1f} ms "
-        f"for a task and {1e3 * costs['report']:.1f} ms for a report, "
+        f"for a task and {1e3 * costs['report']:.1f} ms for a report, {costs['coarse']:.0%} of a scene's seconds for its coarse fit, "
         f"{1e6 * costs['pixel']:.2f} core seconds and {costs['pixel_bytes']:.1f} MB for a million pixels."
     )
     return known + "\n\n" + markdown(list(TITLES.values()), [[_cell(name, row.get(name, "")) for name in TITLES] for row in data["rows"]])

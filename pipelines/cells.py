@@ -24,7 +24,6 @@ from fieldfuse.render.image import make_renderer
 from fieldfuse.stereo.transients import load_left_out, save_left_out
 from fieldfuse.training.cells import scene as cells
 from fieldfuse.training.fit import TIMELINE_PIXELS, Begin, FitResult, Sample
-from fieldfuse.training.guided import fit_guided
 
 FOLDER = "cells"
 LEFT_OUT, MATCHED = "left_out.safetensors", "matched.json"  # of the coarse fit, and so of the whole
@@ -38,7 +37,7 @@ def fit_in_cells(job: Job, views: Views, scene: Scene, begin: Begin) -> FitResul
         begin: what the coarse fit begins with.
 
     Raises:
-        InputError: the cluster cannot be used, or the seconds are too few for the coarse field.
+        InputError: the cluster cannot be used.
         FieldfuseError: a cell could not be fitted; the others are kept.
         Interrupted: the user asked to stop; what was fitted is kept.
     """
@@ -54,14 +53,18 @@ def fit_in_cells(job: Job, views: Views, scene: Scene, begin: Begin) -> FitResul
             if plan is None or plan.key != key:
                 for file in folder.iterdir():
                     remove(file)
-                plan = _cut(job, folder, key, views, scene, begin)
+                coarse = _fit_coarse(job, folder, views, scene, begin)
+                if coarse.done == 1:
+                    coarse.notes.append("seconds or steps were too few for the finer lattice that cells would have: fitted in one piece")
+                    return coarse
+                plan = cells.write_scene(folder, key, coarse, scene, settings, job.progress)
             _fit_missing(job, folder, plan, workers)
             cells.remove_pixels(folder)
     notes = [f"fitted as {plan.count} cells of a lattice of {plan.resolution}³ voxels around a coarse field"]
     field, remarks = cells.merge_scene(folder, plan)
     known = [cells.fitted_cell(folder, plan, cell) or {} for cell in range(plan.count)]
     seconds = plan.seconds_before + sum(facts["seconds"] for facts in known)
-    result = FitResult(field, seconds=seconds, steps=sum(facts["steps"] for facts in known), notes=notes + remarks)
+    result = FitResult(field, seconds=seconds, steps=plan.steps_before + sum(facts["steps"] for facts in known), notes=notes + remarks)
     result.rays = plan.rays_before + sum(facts["rays"] for facts in known)
     result.left_out = load_left_out(folder / LEFT_OUT) if (folder / LEFT_OUT).is_file() else None
     result.matched = read_json(folder / MATCHED) if (folder / MATCHED).is_file() else None
@@ -80,10 +83,8 @@ class _Shown:
         return self._view(origins, directions).colour
 
 
-def _cut(job: Job, folder: Path, key: str, views: Views, scene: Scene, begin: Begin) -> cells.ScenePlan:
-    settings = job.settings
-    coarse = cells.coarse_settings(settings, cells.coarse_resolution(views, scene, settings))
-    result = fit_guided(views, scene, coarse, job.progress, begin)
+def _fit_coarse(job: Job, folder: Path, views: Views, scene: Scene, begin: Begin) -> FitResult:
+    result = cells.fit_coarse(views, scene, job.settings, job.progress, begin)
     if result.interrupted:
         raise Interrupted("stopped on request before the coarse field was done; run the same command again")
     if not isinstance(result.field.decoder, Deferred):
@@ -92,7 +93,7 @@ def _cut(job: Job, folder: Path, key: str, views: Views, scene: Scene, begin: Be
         save_left_out(folder / LEFT_OUT, result.left_out)
     if result.matched is not None:
         write_json(folder / MATCHED, result.matched)
-    return cells.write_scene(folder, key, result, scene, settings, job.progress)
+    return result
 
 
 def _fit_missing(job: Job, folder: Path, plan: cells.ScenePlan, workers: Workers) -> None:

@@ -6,7 +6,7 @@ import pytest
 
 from benchmarks import cluster_scale as scale
 
-COSTS = {"run": 0.5, "cell": 1.0, "task": 0.002, "report": 0.001, "pixel": 3.5e-6, "pixel_bytes": 15.0}
+COSTS = {"run": 0.5, "cell": 1.0, "task": 0.002, "report": 0.001, "coarse": 0.3, "pixel": 3.5e-6, "pixel_bytes": 15.0}
 
 
 def test_tasks_on_one_core_follow_one_another(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -12,6 +12,7 @@ from fieldfuse.render.field import Field
 from fieldfuse.render.numba_renderer import NumbaRenderer
 from fieldfuse.training.cells.merge import NotCoveredError, check_coverage, merged
 from fieldfuse.training.cells.partition import Cells, cut, morton, region_mask
+from fieldfuse.training.cells.pixels import STRIDE, Sight, pools
 from fieldfuse.training.levels import finer
 from fieldfuse.training.losses import Rates
 from fieldfuse.training.numba_engine import NumbaEngine
@@ -142,3 +143,21 @@ def test_a_cell_that_came_back_empty_is_refused() -> None:
     result = merged(coarse, cells, [fields[0], empty, fields[2]].__getitem__)
     with pytest.raises(NotCoveredError, match="cell 2 of 3 came back with 0%"):
         check_coverage(coarse, coarse.occupied.view(-1, 512).sum(1).numpy(), cells, result)
+
+
+@pytest.mark.parametrize("masked", [False, True])
+def test_a_cells_pixels_are_those_it_is_seen_at(masked: bool) -> None:
+    views = made_views(side=22)
+    valid = [np.random.default_rng(index).random((22, 22)) < 0.6 for index in range(len(views))]
+    views = replace(views, valid=valid if masked else [])
+    field = random_field(1.0, 32, keep=0.1, raw=-1.0)
+    cells = cut(field.topology.keys.numpy(), field.occupied.view(-1, 512).sum(1).numpy(), 3)
+    sight = Sight(field, 1)
+    seen, whole = np.array(list(sight.cells_of_pixels(views, cells))), PixelPool(views, depth=True)
+    view, row, column = whole.seen_at(torch.arange(len(whole)))
+    for cell, pool in enumerate(pools(views, cells, sight, depth=True)):
+        expected = torch.from_numpy(seen[view, cell, row // STRIDE, column // STRIDE]).nonzero().squeeze(1)
+        assert 0 < len(pool) == len(expected) < len(whole)
+        mine, all_of_it = pool.take(torch.arange(len(pool))), whole.take(expected)
+        for name in ("origins", "directions", "colour", "distance"):
+            assert torch.equal(getattr(mine, name), getattr(all_of_it, name)), name

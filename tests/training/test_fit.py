@@ -199,3 +199,14 @@ def test_coarse_levels_end_soon_where_no_validation_views_tell_that_they_gain_no
     late = (0.7, 0.8, 0.9)
     result = fit_field(sphere_views(), scene(), wanted("budget=10"), progress, Begin(rungs=late))
     assert result.field.resolution == 64 and climbed[0] <= 2  # by `UNTOLD`, or as soon as a level has had time to grow, not by `late`
+
+
+@pytest.mark.parametrize(("tick", "ends_early"), [(0.01, True), (0.04, False)])
+def test_a_fit_ends_where_others_go_on_if_there_is_time_for_them(tick: float, ends_early: bool, monkeypatch: pytest.MonkeyPatch) -> None:
+    ticking(monkeypatch, tick)
+    result = fit_field(sphere_views(), scene(), wanted("field.resolution=32"), begin=Begin(until=64))
+    assert result.field.resolution == 32
+    if ends_early:
+        assert 0 < result.done < 0.5 and 100 <= result.steps < 300
+    else:
+        assert result.done == 1 and result.seconds > 5.9

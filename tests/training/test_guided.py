@@ -65,7 +65,7 @@ def test_depth_by_matching_makes_geometry_better() -> None:
 
 def test_cells_are_fitted_to_the_depth_that_was_matched(tmp_path: Path) -> None:
     settings = wanted("fit.cells=2")
-    result = fit_guided(views(), SCENE, cells.coarse_settings(settings, 32), ticks=steady(0.005))
+    result = cells.fit_coarse(views(), SCENE, settings, ticks=steady(0.005))
     assert not any(depth is not None for depth in views().depths)
     plan = cells.write_scene(tmp_path, "key", result, SCENE, settings)
     assert plan.count == 2 and plan.rough

@@ -57,6 +57,12 @@ def test_a_level_that_would_see_too_few_rays_is_not_entered() -> None:
     assert not schedule.worth(1000, 100) and schedule.ladder == [32] and schedule.finest
 
 
+def test_the_last_level_waits_where_others_fit_it() -> None:
+    schedule, usual = replace(plan(), hold=0.4, level=1, steps_here=200), replace(plan(), level=1, steps_here=200)
+    assert usual.wants_finer(0.35) and not schedule.wants_finer(0.35) and schedule.wants_finer(0.41)
+    assert replace(schedule, level=0).wants_finer(0.35)
+
+
 def test_a_lattice_finer_than_usual_wants_more_rays_a_voxel_and_is_not_made_too_large() -> None:
     def asked(voxels: float, rays_left: float) -> tuple[bool, list[int]]:
         schedule = Schedule([512, 1024], 10.0, FitSettings(), True)
@@ -68,6 +74,7 @@ def test_a_lattice_finer_than_usual_wants_more_rays_a_voxel_and_is_not_made_too_
     assert asked(1e6, FINE_WORTH * surface) == (True, [512, 1024])
     assert asked(1e6, 0.9 * FINE_WORTH * surface) == (False, [512])
     assert asked(2 * FINE_MOST, 1e9)[0] and not asked(2.1 * FINE_MOST, 1e9)[0]
+    assert Schedule([512, 1024], 10.0, FitSettings(), True).worth(2.1 * FINE_MOST, 1e9, bounded=False)
 
 
 @pytest.mark.parametrize("rungs", [RUNGS, PARTLY, GUESSED])

@@ -44,6 +44,7 @@ VALIDATION_PIXELS = 2048
 VALIDATION_SHARE = 20  # every n-th training view steers the schedule …
 LEAST_VIEWS = 24  # … when there are enough: with few views each of them is worth more than what it would decide
 MANY_ROWS = 2**19  # from here on memory of rows that pruning left unused is given back
+HOLD = 0.4  # share of a fit before which others do not go on: its decoder has to be good by then
 MANY_VOXELS = 2_000_000  # beyond this a finer level is made only where rays came
 
 
@@ -62,6 +63,7 @@ class FitResult:
     left_out: LeftOut | None = None  # what the fit did without, since it moves (`guided.py`)
     held_out: list[float] = default(default_factory=list)  # the timeline's last PSNR by held-out view
     views: Views | None = None  # that it was fitted to: with the depth that was matched, without what moves
+    done: float = 1.0  # share of the whole fit that this is; less than 1: it ended at `Begin.until`
 
     def after(self, seconds: float) -> list[dict[str, float]]:
         """The timeline, with so many seconds before it."""
@@ -95,12 +97,15 @@ class Begin:
         coarse: `start` is a first guess and no fitted field: climb from its level to the finest, as from the classical start.
         rungs: share of the budget at which each level ends at the latest, from the first one on; with too few views to keep some aside for
             validation it ends by `UNTOLD`, if that is sooner. None: as fits the start.
+        until: voxels a side of a finer level that others will fit (`training/cells`): where it would begin, the fit ends. It goes on to its
+            end on the level before where seconds are too few for that one.
     """
 
     host: Host | None = None
     start: Field | Callable[[], Field] | None = None
     coarse: bool = False
     rungs: tuple[float, ...] | None = None
+    until: int | None = None
 
 
 class Shows(Protocol):
@@ -202,6 +207,8 @@ def fit_field(
         if begin.coarse:
             ladder += [resolution for resolution in _ladder(views, scene, settings)[1] if resolution > start.resolution]
     start = None  # its rows are the host's now
+    if begin.until is not None and begin.until > ladder[-1]:
+        ladder.append(begin.until)
     engine = make_engine(settings, current, pool)
     rungs = begin.rungs or RUNGS
     plan = Schedule(
@@ -215,6 +222,7 @@ def fit_field(
         trust=ROUGH if views.rough else FINE,
         rungs=rungs if aside.any() else tuple(map(min, rungs, UNTOLD)),
         wider=WIDER if chosen_engine(settings, device) == "triton" else 1,
+        hold=0.0 if begin.until is None else HOLD,
     )
     softens, radius = len(train) >= LEAST_VIEWS, 0.0
     policy = NonfinitePolicy()
@@ -231,7 +239,12 @@ def fit_field(
                 voxels = int(came.sum()) * growth  # what stays for the sake of holes gets no rays, so it does not decide
                 near = looked_at(current, engine.seen, engine.visits, settings.fit.prune_weight)
                 keep = keep & near if plan.level == len(ladder) - 2 else came
-            if plan.worth(voxels, plan.rays_left(now, result.rays)) and memory_limits.fits(current, keep, plan, settings, policy.notes):
+            others = ladder[plan.level + 1] == begin.until
+            worth = plan.worth(voxels, plan.rays_left(now, result.rays), bounded=not others)
+            if worth and others:
+                result.done = done
+                break
+            if worth and memory_limits.fits(current, keep, plan, settings, policy.notes):
                 plan.climb()
                 engine.release()
                 give_back()

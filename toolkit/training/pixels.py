@@ -104,14 +104,24 @@ class PixelPool:
     def __len__(self) -> int:
         return len(self.colour)
 
-    def some(self, picks: Tensor) -> PixelPool:
-        """A pool of its own with the pixels `picks` (P,), ascending, and the views that have any of them."""
-        view, row, column = self.seen_at(picks)
-        kept, counts = view.unique_consecutive(return_counts=True)
-        places = (row * self.camera[view, 4].long() + column).int()
-        distance = self.distance[picks] if len(self.distance) else self.distance
-        starts = torch.cat([counts.new_zeros(1), counts.cumsum(0)])
-        return PixelPool.of((self.colour[picks], places, starts, distance, self.camera[kept], self.pose[kept]), self.height)
+    def some(self, parts: Sequence[tuple[int, Tensor]]) -> PixelPool:
+        """A pool of its own with some views' pixels.
+
+        Args:
+            parts: views, ascending, and of each (≥ H · W,) bool, the places in its image whose pixels are wanted.
+        """
+        picks, places = [], []
+        for view, wanted in parts:
+            begin, end = int(self.starts[view]), int(self.starts[view + 1])
+            taken = wanted[self.places[begin:end].long()] if len(self.places) else wanted[: end - begin]
+            own = taken.nonzero().squeeze(1)
+            picks.append(own + begin)
+            places.append(self.places[begin:end][own] if len(self.places) else own.int())
+        counts = torch.tensor([0] + [len(own) for own in picks])
+        kept, pick = torch.tensor([view for view, _ in parts], dtype=torch.int64), torch.cat([torch.zeros(0, dtype=torch.int64), *picks])
+        distance = self.distance[pick] if len(self.distance) else self.distance
+        arrays = self.colour[pick], torch.cat([self.places[:0], *places]), counts.cumsum(0), distance, self.camera[kept], self.pose[kept]
+        return PixelPool.of(arrays, self.height)
 
     @classmethod
     def of(cls, arrays: Sequence[Tensor], height: int) -> PixelPool:

@@ -65,6 +65,7 @@ class Schedule:
         steps, steps_here: taken so far, in all and at this level.
         wider: times as many rays a step as `FIRST_BATCH` and `fit.max_rays`.
         prune_every: steps from one pruning to the next.
+        hold: share of the budget before which the last level does not begin.
     """
 
     ladder: list[int]
@@ -78,6 +79,7 @@ class Schedule:
     rungs: tuple[float, ...] = RUNGS
     wider: int = 1
     prune_every: int = PRUNE_EVERY
+    hold: float = 0.0
     level: int = 0
     steps: int = 0
     steps_here: int = 0
@@ -152,6 +154,8 @@ class Schedule:
             return not self.finest and self.steps_here >= every
         if self.finest or self.steps_here < LEVEL_STEPS or done >= self.rungs[-1]:
             return False
+        if done < self.hold and self.level == len(self.ladder) - 2:
+            return False
         return done > self.deadline() or self.plateau()
 
     def deadline(self) -> float:
@@ -161,15 +165,15 @@ class Schedule:
         place = self.level * max(usual - 1, 0) / (climbs - 1) if climbs > max(usual, 1) else self.level
         return float(np.interp(place, range(len(self.rungs)), self.rungs))
 
-    def worth(self, voxels: float, rays_left: float) -> bool:
-        """Whether a finer level would see enough rays, and have few enough voxels; if not, this level is the last.
+    def worth(self, voxels: float, rays_left: float, bounded: bool = True) -> bool:
+        """Whether a finer level would see enough rays, and, if `bounded`, have few enough voxels; if not, this level is the last.
 
         Args:
             voxels: that it would have at most, were all of the voxels that stay split.
         """
         finer = self.ladder[self.level + 1]
         surface = voxels * self.resolution / finer  # a finer surface is thinner, too
-        if rays_left >= WORTH * voxels if finer < FINER else surface <= min(FINE_MOST, rays_left / FINE_WORTH):
+        if rays_left >= WORTH * voxels if finer < FINER else surface <= min(FINE_MOST if bounded else math.inf, rays_left / FINE_WORTH):
             return True
         del self.ladder[self.level + 1 :]
         return False

@@ -84,13 +84,11 @@ def pools(views: Views, cells: Cells, sight: Sight, depth: bool) -> Iterator[Pix
     """
     seen = [np.packbits(one, axis=0) for one in sight.cells_of_pixels(views, cells)]
     whole = PixelPool(views, depth=depth)
-    starts = whole.starts.tolist()
     for cell in range(cells.count):
-        picks = []
-        for index, bits in enumerate(seen):
-            held = torch.from_numpy((bits[cell // 8] >> (7 - cell % 8) & 1).astype(bool))
-            if held.any():
-                own = torch.arange(starts[index], starts[index + 1])
-                _, row, column = whole.seen_at(own)
-                picks.append(own[held[row // STRIDE, column // STRIDE]])
-        yield whole.some(torch.cat(picks) if picks else torch.zeros(0, dtype=torch.int64))
+        held = ((bits[cell // 8] >> (7 - cell % 8) & 1).astype(bool) for bits in seen)
+        yield whole.some([(view, _pixels(places, views.intrinsics[view].width)) for view, places in enumerate(held) if places.any()])
+
+
+def _pixels(places: Array, width: int) -> torch.Tensor:
+    """(h, w) bool by places → (≥ H · W,) bool, the pixels of an image so wide, row after row."""
+    return torch.from_numpy(places.repeat(STRIDE, 0).repeat(STRIDE, 1)[:, :width].reshape(-1))

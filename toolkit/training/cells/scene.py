@@ -39,15 +39,16 @@ from fieldfuse.training.cells.merge import NotCoveredError, check_coverage, merg
 from fieldfuse.training.cells.partition import Cells, cut, region_mask
 from fieldfuse.training.cells.pixels import Sight, pools
 from fieldfuse.training.engine import warm_up
-from fieldfuse.training.fit import DEFAULT_BUDGET, FitResult
+from fieldfuse.training.fit import DEFAULT_BUDGET, Begin, FitResult
+from fieldfuse.training.guided import fit_guided
 from fieldfuse.training.levels import pruned
 from fieldfuse.training.losses import FINE, ROUGH
 from fieldfuse.training.pixels import PixelPool
 from fieldfuse.training.start import finest_resolution, space_of
 from fieldfuse.volume.edit import dilate
 
-COARSE_SHARE = 0.55  # of the seconds or steps of the whole fit: with 0.35 cells have more of them, and are not better (a house)
 LEAST_RESOLUTION = 32  # of a coarse field
+LEAST_LEFT = 0.1  # of the seconds, for all cells
 PIXELS_A_CELL = 8_000_000  # of training images, where the number of cells is chosen (`auto`)
 # Memory of a cell's fit: libraries, kernels and the coarse field; a value of a lattice corner, with what Adam keeps of it.
 BASE, CORNER_BYTES = 700 * 2**20, 12
@@ -63,9 +64,10 @@ class ScenePlan:
         settings: of the run, plain.
         count: cells.
         resolution: of the finest lattice.
-        rays_before, seconds_before: that the coarse field took.
+        done_before: share of the whole fit that the coarse field was.
+        rays_before, steps_before, seconds_before: that it took, seconds with the cut.
         shares: of the scene's pixels, by cell; a pixel may be seen in several.
-        seconds, steps: of each cell, None: without end.
+        seconds: of each cell. steps: of every cell, None: without end.
         memory: bytes that the fit of each takes at most, roughly.
         slow_within: working units.
         rough: whether depth was matched quickly, and is trusted less.
@@ -76,11 +78,13 @@ class ScenePlan:
     settings: dict[str, Any]
     count: int
     resolution: int
+    done_before: float
     rays_before: int
+    steps_before: int
     seconds_before: float
     shares: list[float]
     seconds: list[float]
-    steps: list[int] | None
+    steps: int | None
     memory: list[int]
     slow_within: float
     rough: bool
@@ -94,11 +98,22 @@ def coarse_resolution(views: Views, scene: Scene, settings: Settings) -> int:
     return max(LEAST_RESOLUTION, finest // (COARSER * BLOCK * 2) * BLOCK * 2)
 
 
-def coarse_settings(settings: Settings, resolution: int) -> Settings:
-    """The settings of the coarse field's fit."""
-    fit, seconds = settings.fit, COARSE_SHARE * (settings.fit.budget or DEFAULT_BUDGET)
-    steps = None if fit.iterations is None else max(1, round(COARSE_SHARE * fit.iterations))
-    return replace(settings, field=replace(settings.field, resolution=resolution), fit=replace(fit, budget=seconds, iterations=steps))
+def fit_coarse(
+    views: Views,
+    scene: Scene,
+    settings: Settings,
+    progress: Progress = SILENT,
+    begin: Begin = Begin(),  # noqa: B008 (frozen)
+    ticks: Callable[[], float] = time.perf_counter,
+) -> FitResult:
+    """The first part of a fit in one piece: all of it but its finest level, which cells are to fit. `done` of the result is its share, 1
+    where seconds or steps are too few for that level.
+
+    Args and errors as of `fit_guided`.
+    """
+    resolution = coarse_resolution(views, scene, settings)
+    coarse = replace(settings, field=replace(settings.field, resolution=resolution))
+    return fit_guided(views, scene, coarse, progress, replace(begin, until=COARSER * resolution), ticks)
 
 
 def cell_count(views: Views, settings: Settings) -> int:
@@ -112,11 +127,20 @@ def cell_count(views: Views, settings: Settings) -> int:
     return max(1, round(pixels / PIXELS_A_CELL))
 
 
-def write_scene(folder: Path, key: str, result: FitResult, scene: Scene, settings: Settings, progress: Progress = SILENT) -> ScenePlan:
-    """Cut a scene by its coarse field into `cell_count` cells.
+def write_scene(
+    folder: Path,
+    key: str,
+    result: FitResult,
+    scene: Scene,
+    settings: Settings,
+    progress: Progress = SILENT,
+    ticks: Callable[[], float] = time.perf_counter,
+) -> ScenePlan:
+    """Cut a scene by its coarse field into `cell_count` cells. They share the seconds that are left.
 
     Args:
-        result: of the coarse fit, whose views the cells are fitted to.
+        result: of `fit_coarse`, whose views the cells are fitted to.
+        ticks: the clock that the budget is counted on.
 
     Raises:
         InputError: training rays see nothing of the field.
@@ -125,6 +149,7 @@ def write_scene(folder: Path, key: str, result: FitResult, scene: Scene, setting
     """
     if (shown := result.views) is None:
         raise ValueError("a result that was not just fitted has no views")
+    began = ticks()
     train = shown.subset(np.flatnonzero(~shown.test))
     coarse = result.field
     least = settings.fit.prune_weight
@@ -150,19 +175,23 @@ def write_scene(folder: Path, key: str, result: FitResult, scene: Scene, setting
         region = int(region_mask(coarse, cells, cell, coarse.resolution, COARSER * coarse.resolution).sum())
         corners = COARSER**3 * region * CORNER_BYTES * (coarse.feature_rows.shape[1] + 1)
         memory.append(BASE + 2 * sum(values.nbytes for values in arrays.values()) + corners)
-    parts = [(1 - COARSE_SHARE) * size / sum(sizes) for size in sizes]
+    budget, steps = settings.fit.budget or DEFAULT_BUDGET, settings.fit.iterations
+    spent = result.seconds + ticks() - began
     # What a fit in one piece would have on this machine: cells have one thread each, however many are fitted side by side.
-    budget, steps = (settings.fit.budget or DEFAULT_BUDGET) * (settings.threads or torch.get_num_threads()), settings.fit.iterations
+    left = max(budget - spent, LEAST_LEFT * budget) * (settings.threads or torch.get_num_threads())
     plan = ScenePlan(
         key=key,
         settings=settings_dict(settings),
         count=cells.count,
         resolution=COARSER * coarse.resolution,
+        # With steps by these alone: equal ones are to give equal fields.
+        done_before=result.done if steps is None else result.steps / steps,
         rays_before=result.rays,
-        seconds_before=result.seconds,
+        steps_before=result.steps,
+        seconds_before=spent,
         shares=[size / whole for size in sizes],
-        seconds=[part * budget for part in parts],
-        steps=None if steps is None else [max(1, round(part * steps)) for part in parts],
+        seconds=[left * size / sum(sizes) for size in sizes],
+        steps=None if steps is None else max(1, steps - result.steps),
         memory=memory,
         slow_within=settings.fit.slow_within * scene.median_depth,
         rough=shown.rough,
@@ -255,10 +284,10 @@ def fit_cell_of(argument: tuple[str, int], progress: Progress, ticks: Callable[[
     of_cell = CellPlan(
         cell=cell,
         rays_before=plan.rays_before,
-        done_before=COARSE_SHARE,
+        done_before=plan.done_before,
         share=plan.shares[cell],
         seconds=plan.seconds[cell],
-        steps=None if plan.steps is None else plan.steps[cell],
+        steps=plan.steps,
         slow_within=plan.slow_within,
         trust=ROUGH if plan.rough else FINE,
         opaque=plan.opaque,
