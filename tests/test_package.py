@@ -134,7 +134,7 @@ def test_it_works_in_another_project(elsewhere: tuple[Path, Path], wheel: Path) 
 FILM = "from fieldfuse.simulate.demo import write_demo_video; write_demo_video('demo/demo.mp4', frames=16, size=(320, 240))"
 
 
-@pytest.mark.slow
+@pytest.mark.long
 def test_the_demo_runs_in_another_project(elsewhere: tuple[Path, Path]) -> None:
     """On a shorter, smaller film than that of `make demo`, without the networks and with fewer exports: most of it is compiling kernels."""
     python, project = elsewhere

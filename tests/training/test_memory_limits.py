@@ -71,7 +71,7 @@ def held_and_foreseen(decoder: str, threads: int) -> tuple[float, int, int]:
 def test_a_fit_climbs_where_there_is_little_memory_but_enough(monkeypatch: pytest.MonkeyPatch) -> None:
     """What is sized for the worst case and never written is not reserved."""
     settings = wanted("engine=numba", "budget=3", "field.resolution=64", "threads=1")
-    monkeypatch.setattr(Schedule, "worth", lambda self, voxels, rays_left: True)
+    monkeypatch.setattr(Schedule, "worth", lambda self, voxels, rays_left, bounded=True: True)
     reached = []
     for free in (2**21, 2**26):
         ticking(monkeypatch, 0.02)
@@ -84,7 +84,7 @@ def test_a_fit_climbs_where_there_is_little_memory_but_enough(monkeypatch: pytes
 
 def test_a_level_that_does_not_fit_is_not_made_and_told(monkeypatch: pytest.MonkeyPatch) -> None:
     ticking(monkeypatch, 0.02)
-    monkeypatch.setattr(Schedule, "worth", lambda self, voxels, rays_left: True)
+    monkeypatch.setattr(Schedule, "worth", lambda self, voxels, rays_left, bounded=True: True)
     settings = wanted("engine=torch", "budget=3", "field.resolution=64")
     assert fit_field(sphere_views(), scene(), settings).field.resolution == 64
     ticking(monkeypatch, 0.02)

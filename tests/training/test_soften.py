@@ -91,7 +91,7 @@ def test_a_fit_ends_with_colours_as_they_are(views: int, reaches: bool, monkeypa
         whole(self, given, radius)  # type: ignore[arg-type]
 
     monkeypatch.setattr(PixelPool, "soften", watched)
-    monkeypatch.setattr(Schedule, "worth", lambda self, voxels, rays_left: reaches)
+    monkeypatch.setattr(Schedule, "worth", lambda self, voxels, rays_left, bounded=True: reaches)
     result = fit_field(sphere_views(views), scene(), wanted("engine=numba", "budget=3", "field.resolution=64"))
     assert result.field.resolution == (64 if reaches else 32)
     if views < fit.LEAST_VIEWS:
