@@ -104,6 +104,14 @@ def test_cells_that_no_node_has_memory_for_are_refused_by_name(room: Path, tmp_p
     assert (tmp_path / "out" / "cells" / "plan.json").is_file()  # the coarse fit is kept
 
 
+def test_too_few_steps_for_the_finer_lattice_stay_in_one_piece(room: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("fieldfuse.pipelines.cells.open_workers", workers_here)
+    answer = said("run", room, "--out", tmp_path / "out", *OPTIONS, "--set", "fit.iterations=60")
+    assert answer.code == 0 and "were too few for the finer lattice that cells would have" in answer.out, answer.err
+    assert Field.load(tmp_path / "out" / "field.safetensors").resolution == 32
+    assert not (tmp_path / "out" / "cells" / "plan.json").exists()
+
+
 def test_a_small_scene_stays_in_one_piece(room: Path, tmp_path: Path) -> None:
     answer = said("run", room, "--out", tmp_path / "out", *SMALL, "--cells", "auto", "--set", "export.formats=[]")
     assert answer.code == 0 and "small enough to be fitted in one piece" in answer.out
