@@ -66,7 +66,7 @@ test test-all: $(VENV)/.installed-test links
 
 stability: $(VENV)/.installed-test
 	$(BIN)/python -m pytest tests/stability/hard --page docs/stability.md
-	$(BIN)/python -m pytest -m long tests/cluster tests/test_package.py
+	$(BIN)/python -m pytest -m long tests/cluster
 	$(BIN)/python -m tests.stability kills --page docs/stability.md
 	$(BIN)/python -m tests.stability stops --page docs/stability.md
 

@@ -44,8 +44,8 @@ VALIDATION_PIXELS = 2048
 VALIDATION_SHARE = 20  # every n-th training view steers the schedule …
 LEAST_VIEWS = 24  # … when there are enough: with few views each of them is worth more than what it would decide
 MANY_ROWS = 2**19  # from here on memory of rows that pruning left unused is given back
-HOLD = 0.4  # share of a fit before which others do not go on: its decoder has to be good by then
 MANY_VOXELS = 2_000_000  # beyond this a finer level is made only where rays came
+HOLD = 0.4  # share of a fit before which cells do not go on from it: their decoder is the one it has then
 
 
 @dataclass
@@ -97,8 +97,8 @@ class Begin:
         coarse: `start` is a first guess and no fitted field: climb from its level to the finest, as from the classical start.
         rungs: share of the budget at which each level ends at the latest, from the first one on; with too few views to keep some aside for
             validation it ends by `UNTOLD`, if that is sooner. None: as fits the start.
-        until: voxels a side of a finer level that others will fit (`training/cells`): where it would begin, the fit ends. It goes on to its
-            end on the level before where seconds are too few for that one.
+        until: voxels a side of a finer level that cells will fit (`training/cells`): where it would begin, the fit ends. Where seconds are
+            too few for that level, the fit goes on to its end on the one before.
     """
 
     host: Host | None = None
@@ -239,9 +239,10 @@ def fit_field(
                 voxels = int(came.sum()) * growth  # what stays for the sake of holes gets no rays, so it does not decide
                 near = looked_at(current, engine.seen, engine.visits, settings.fit.prune_weight)
                 keep = keep & near if plan.level == len(ladder) - 2 else came
-            others = ladder[plan.level + 1] == begin.until
-            worth = plan.worth(voxels, plan.rays_left(now, result.rays), bounded=not others)
-            if worth and others:
+            # A level that cells fit need not stay small, nor fit into the memory of this machine.
+            by_cells = ladder[plan.level + 1] == begin.until
+            worth = plan.worth(voxels, plan.rays_left(now, result.rays), bounded=not by_cells)
+            if worth and by_cells:
                 result.done = done
                 break
             if worth and memory_limits.fits(current, keep, plan, settings, policy.notes):

@@ -117,8 +117,8 @@ class PixelPool:
             own = taken.nonzero().squeeze(1)
             picks.append(own + begin)
             places.append(self.places[begin:end][own] if len(self.places) else own.int())
-        counts = torch.tensor([0] + [len(own) for own in picks])
-        kept, pick = torch.tensor([view for view, _ in parts], dtype=torch.int64), torch.cat([torch.zeros(0, dtype=torch.int64), *picks])
+        counts, kept = self.starts.new_tensor([0, *map(len, picks)]), self.starts.new_tensor([view for view, _ in parts])
+        pick = torch.cat([self.starts[:0], *picks])
         distance = self.distance[pick] if len(self.distance) else self.distance
         arrays = self.colour[pick], torch.cat([self.places[:0], *places]), counts.cumsum(0), distance, self.camera[kept], self.pose[kept]
         return PixelPool.of(arrays, self.height)
